@@ -234,7 +234,7 @@ BENCHMARKS = {
     ),
     "inertial": Benchmark(
         "inertial.inertial_benchmark",
-        "Dark stretches with and without an inertial sensor, or its gyro; faults of its table (extra 'train').",
+        "Dark stretches with and without an inertial sensor, or its gyro alone (extra 'train').",
         (
             _DATA_IF_ANY,
             _names("worlds", "room, street or mh01, with commas."),

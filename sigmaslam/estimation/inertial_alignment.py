@@ -30,7 +30,8 @@ _ACCEL_BIAS = 0.2
 _GRAVITY_LENGTH = 0.05
 # Metres and radians by which poses from frame to frame are off at least, and rad/s that a gyro's bias then is.
 _LEAST_PLACE, _LEAST_TURN = 2e-4, 2e-4
-# Gravity whose length is off by more was not found, m/s^2; nor was one whose direction is less certain, radians.
+# Gravity whose length is off by more than three sigmas and this was not found, m/s^2; nor was one whose direction is
+# less certain, radians.
 _LENGTH_TOLERANCE, _LEAST_TILT_CERTAINTY = 0.5, 0.05
 # Turns of gyro and images that differ by more are not of one body: of the turns, and radians from frame to frame.
 _TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
@@ -58,11 +59,6 @@ class Alignment:
     biases: np.ndarray
     covariance: np.ndarray
     shared: np.ndarray
-
-    @property
-    def tilt(self) -> float:
-        """Standard deviation of gravity's direction, radians, of the less certain axis."""
-        return _tilt(self.covariance)
 
 
 def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
@@ -112,8 +108,8 @@ def align(
         sensor_sigma: (7,) standard deviations of the clock's delay and of the mounting, perturbed from the left.
     """
     bodies = poses @ mounting
-    found, covariance, length = _solve(bodies, motions)
-    if abs(length - STANDARD_GRAVITY) > _LENGTH_TOLERANCE or _tilt(covariance) > _LEAST_TILT_CERTAINTY:
+    found, covariance, excess = _solve(bodies, motions)
+    if excess > _LENGTH_TOLERANCE or _tilt(covariance) > _LEAST_TILT_CERTAINTY:
         return None
     columns = np.empty((len(found), len(sensor_sigma)))
     for k, sigma in enumerate(sensor_sigma):
@@ -128,11 +124,12 @@ def align(
 
 
 def _tilt(covariance: np.ndarray) -> float:
+    """Standard deviation of gravity's direction, radians, of the less certain axis."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
 
 
 def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, float]:
-    """(12,) velocity, gravity and biases, their covariance (12, 12), and gravity's length before it is assumed."""
+    """(12,) velocity, gravity and biases, their covariance, and by how much gravity's length errs."""
     R, p = bodies[:, :3, :3], bodies[:, :3, 3]
     # Unknown: first place, first velocity, gravity, bias. Place and velocity of each pose as maps of these.
     identity, unknown = np.eye(12), slice(9, 12)
@@ -153,24 +150,23 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
     # Errors of the samples add up between poses that are far apart in time.
     integrated = np.mean([np.trace(each.accel_noise[POSITION, POSITION]) / 3.0 for each in motions])
     least = _LEAST_PLACE**2 + _SAMPLE_NOISE * integrated
-    variance, direction, first = least, np.zeros(3), 0.0
-    for turn in range(3):  # without gravity's length, with it, and with the residuals' size
+    variance, direction = least, np.zeros(3)
+    for _ in range(3):  # without gravity's length, with it, and with the residuals' size
         information, vector = A.T @ A / variance, A.T @ y / variance
         information[unknown, unknown] += np.eye(3) / _ACCEL_BIAS**2
+        free, alone = np.linalg.inv(information), vector.copy()
         information[6:9, 6:9] += np.outer(direction, direction) / _GRAVITY_LENGTH**2
         vector[6:9] += direction * STANDARD_GRAVITY / _GRAVITY_LENGTH**2
         solution = np.linalg.solve(information, vector)
         residual = y - A @ solution
         variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), least)
-        gravity = solution[6:9]
-        length = np.linalg.norm(gravity)
-        first = float(length) if not turn else first
-        direction = gravity / length
+        direction = solution[6:9] / np.linalg.norm(solution[6:9])
+    length, spread = np.linalg.norm((free @ alone)[6:9]), direction @ free[6:9, 6:9] @ direction
     end = np.concatenate([speed, identity[6:9], np.zeros((3, 12)), identity[9:]])
     covariance = end @ np.linalg.inv(information) @ end.T
     bias, covariance[6:9, 6:9] = align_gyro(bodies, motions)
     found = np.concatenate([speed @ solution + speed_known, direction * STANDARD_GRAVITY, bias, solution[unknown]])
-    return found, 0.5 * (covariance + covariance.T), float(first)
+    return found, 0.5 * (covariance + covariance.T), abs(length - STANDARD_GRAVITY) - 3.0 * np.sqrt(spread)
 
 
 class GravitySearch:
@@ -228,8 +224,6 @@ class GravitySearch:
         way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
         _LOGGER.info(
             "gravity is known to %.1f degrees, from %.1f s of images along %.2f m",
-            np.degrees(found.tilt),
-            time - times[0],
-            way,
+            *(np.degrees(_tilt(found.covariance)), time - times[0], way),
         )
         return replace(found, biases=np.r_[bias, np.zeros(3)] + found.biases)

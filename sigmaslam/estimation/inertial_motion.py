@@ -13,7 +13,7 @@ from sigmaslam.estimation.inertial_alignment import GravitySearch
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.preintegration import GYRO_BIAS, TURN, Preintegrated
-from sigmaslam.estimation.standstill import WHILE, Standstill
+from sigmaslam.estimation.standstill import WHILE, Standstill, find_blow
 from sigmaslam.estimation.wheel_speed import WheelSpeed
 from sigmaslam.geometry.inertial_sensor import InertialSensor
 from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_exp, se3_inverse, se3_log, skew
@@ -209,9 +209,13 @@ class InertialMotion(MotionFilter):
         self._note_twist(self.twist[3:])
 
     def _measure_speed(self, motion: Preintegrated, timestamp: float) -> None:
-        """A body at rest measures a velocity of zero and the gyro's bias; wheels measure it unless they slip."""
+        """A body at rest measures velocity zero and the gyro's bias, wheels the velocity; blows may turn the sensor."""
         was_dark, self._is_dark = self._is_dark, True
         recent, P = self.samples.around(timestamp - WHILE, timestamp), self._covariance[_VELOCITY, _VELOCITY]
+        blow = find_blow(recent, timestamp + self.samples.time_shift - motion.seconds)
+        if blow is not None:
+            _LOGGER.warning("the inertial sensor felt a blow at %.3f s, %.0f m/s^2: do the cameras still fit?", *blow)
+            self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2)  # as after a warm-up
         self.is_resting = motion.missing == 0.0 and self._standstill.holds(recent, self._velocity, P, was_dark)
         if self.is_resting:
             slope, noise = np.zeros((6, _SIZE)), np.zeros((6, 6))

@@ -109,7 +109,7 @@ class Localiser:
         self, matches: GuidedMatches, fit: FrameFit | None, measured: Prediction, excess: float
     ) -> FrameFit | None:
         """Takes back by what flow has widened the prediction of a sensor, unless the pose departs from it as well."""
-        if fit is not None and measured.excludes(fit.pose):
+        if fit is not None and measured.excludes(fit.pose) and not self._is_doubtful(matches, fit):
             return fit
         self.motion.widen(1.0 / excess)
         return None if fit is None else self.fit_again(matches, fit, measured)

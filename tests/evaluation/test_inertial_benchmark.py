@@ -1,4 +1,4 @@
-"""The benchmark of the inertial sensor: its errors on known answers, its faults, its page, and a short run."""
+"""The benchmark of the inertial sensor: its errors on known answers, its page, and a short run."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -9,12 +9,11 @@ from typer.testing import CliRunner
 
 from sigmaslam.cli.commands import app
 from sigmaslam.estimation.constant_velocity import MotionState
-from sigmaslam.geometry.se3 import rotation_log, se3_exp
+from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam_benchmarks.inertial import dark_runs, inertial_benchmark
-from sigmaslam_benchmarks.inertial.dark_runs import METHODS, STATES, DarkCase, DarkResult
+from sigmaslam_benchmarks.inertial.dark_runs import METHODS, STATES, DarkResult
 from sigmaslam_benchmarks.inertial.inertial_page import InertialPage, format_page
-from sigmaslam_benchmarks.inertial.table_faults import FaultResult, shift_clock, swap_sign, turn_axes
 from sigmaslam_benchmarks.live import recording_jobs, recordings
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import References
@@ -73,63 +72,57 @@ def test_errors_drawn_from_the_covariance_have_a_nees_of_one(good, walk):
     assert ratio == pytest.approx(1.0, abs=0.1)
 
 
-def test_faults_change_what_they_say(walk):
-    samples, rng = walk[0].samples, np.random.default_rng(4)
-    for _ in range(20):
-        turned, words = turn_axes(samples, rng)
-        turn = np.linalg.lstsq(samples.gyro, turned.gyro)[0].T
-        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
-        assert np.linalg.det(turn) == pytest.approx(1.0)
-        assert np.linalg.norm(rotation_log(turn)) > 1.5
-        assert words.startswith("axes are ")
-        other, words = swap_sign(samples, rng)
-        changed = [np.abs(a - b).max(axis=0) > 0 for a, b in ((other.gyro, samples.gyro), (other.accel, samples.accel))]
-        assert np.concatenate(changed).sum() == 1
-        late, _ = shift_clock(samples, rng)
-        assert 0.01 <= abs(late.timestamp[0] - samples.timestamp[0]) <= 0.2
+RESULT = DarkResult(
+    20, 20, 0, 0.0, 0.0, 0.02, 0.1, 1.2, 0.001, 1.1, 1.3, dict.fromkeys(STATES, 1.2), 0.4, 0.5, 0.003, 50.0, 1.0
+)
 
 
-RESULT = DarkResult(20, 20, 0, 0, 0, 0.02, 0.1, 1.2, 0.001, 1.1, dict.fromkeys(STATES, 1.2), 0.4, 0.5, 0.003, 50.0, 1.0)
-
-
-def test_the_page_says_which_goals_are_missed_and_what_is_not_named():
+def test_the_page_says_which_goals_are_missed():
     room, mh01 = Recording("room7", "room", 170, 7, 200.0), Recording("mh01", "mh01", 100, 7)
-    bad = replace(RESULT, end_metres=0.07, end_sigmas=3.0, lost=2, back=-1)
+    bad = replace(RESULT, end_metres=0.07, end_sigmas=3.0, lost=2, back=-1.0)
     runs = {}
     for recording, result in ((room, RESULT), (mh01, bad)):
         for method in METHODS:
-            runs[recording, DarkCase(method)] = RESULT
-            runs[recording, DarkCase(method, 1.0, 20)] = result
-    good = FaultResult("", "good", True, ["/home/me/imu0/data.csv: a|b"])
-    faults = [(room, FaultResult("sign", "sign of rate x", False, [])), (room, good)]
-    page = format_page(InertialPage("sigmaslam benchmark inertial", (1.0, 2.0), runs, faults, 3))
+            runs[recording, method, 0, 0.0] = RESULT
+            runs[recording, method, 20, 0.5] = replace(result, back=np.nan)
+            runs[recording, method, 20, 1.0] = result
+    page = format_page(InertialPage("sigmaslam benchmark inertial", runs, 3))
     assert "| MH_01, 1 s: frames lost | 0 | 2, **missed** |" in page
     assert "| MH_01, 1 s: largest error, m | 0.05 | 0.070, **missed** |" in page
     assert "| renders with images: NEES of gyro bias | 0.7 - 1.4 | 1.20 |" in page
     assert "Missed: MH_01, 1 s: frames lost (2)" in page
-    assert "| faulty tables that are named | all | 0 of 1, **missed** |" in page
-    assert "| room7 | sign of rate x | nothing |" in page
-    assert "- room7: imu0/data.csv: a\\|b" in page
     assert "**3 runs are missing: the same command goes on.**" in page
-    assert "| room | 1 | images | 1 | 20 | 20 | 0 | 0 | 0 | 100% | 0.020 | 0.020 |" in page
-    assert "| mh01 | 20 | " not in page
+    assert "| room | 1 | images | 1 | 20 | 20 | 0 | 0.020 | 0.020 | 0.10 | 100% | 1.10 | 1.30 |" in page
+    assert "| mh01 | 1 | both sensors | 1 | 0 | 1 | 0 | 0.001 | 0.001 |" in page
+    assert "| mh01 | 0.5 | both sensors | 1 | 0 " not in page
 
 
-def test_a_dark_stretch_leaves_frames_after_it_and_faults_are_dealt_to_the_first_recordings(tmp_path):
+def test_a_dark_stretch_leaves_frames_after_it(tmp_path):
     (tmp_path / recordings.REAL["mh01"][0]).mkdir()
-    chosen = recordings.choose_recordings(None, tmp_path, 100, 10, inertial_benchmark.FRAMES, 200.0)
-    chosen.sort(key=lambda each: each.exact)
-    assert [each.name for each in chosen[:3]] == ["mh01", "room100", "street100"]
-    for recording in chosen:
+    for recording in recordings.choose_recordings(None, tmp_path, 100, 2, inertial_benchmark.FRAMES, 200.0):
         rate = 10.0 if recording.kind == "street" else 20.0
-        cases = inertial_benchmark.dark_cases(recording)
-        assert max(case.first + round(case.seconds * rate) for case in cases) <= recording.frames - 5
-        assert {case.seconds for case in cases} >= {0.0, 0.5, 1.0, 2.0}
-    faults = inertial_benchmark.deal_faults(chosen, 100)
-    dealt = [fault.kind for found in faults.values() for fault in found if fault.kind]
-    assert len(dealt) == 40
-    assert {kind: dealt.count(kind) for kind in dealt} == dict.fromkeys(["deg/s", "g", "axes", "sign", "clock"], 8)
-    assert list(faults) == chosen[:7]
+        cases = inertial_benchmark.dark_cases(recording, METHODS)
+        assert max(case.first + round(case.marks[-1] * rate) for case in cases) <= recording.frames - 5
+        assert {seconds for case in cases for seconds in case.marks} >= {0.0, 0.5, 1.0, 2.0}
+        assert len({case.name for case in cases}) == len(cases)
+
+
+def test_a_run_is_judged_after_each_while_in_the_dark_and_what_follows_at_its_end(good, walk):
+    poses = walk[1]
+    dark = range(10, 20)
+    tracked = []
+    for k, pose in enumerate(poses):
+        away = np.eye(4)
+        away[0, 3] = 1e-3 * max(0, min(k, dark.stop - 1) - 9)
+        step = np.linalg.inv(poses[5]) @ pose
+        motion = MotionState(step, np.zeros(19), np.diag(SIGMA**2))
+        status = "inertial" if k in dark else "tracking"
+        tracked.append(dark_runs._Tracked(status, pose @ away, 5, motion, False, 0.1))
+    half, whole = (dark_runs._judge(tracked, good, range(10, stop), stop == 20) for stop in (15, 20))
+    assert [half.dark, half.inertial, whole.dark] == [5, 5, 10]
+    assert [half.end_metres, whole.end_metres] == pytest.approx([5e-3, 10e-3])
+    assert np.isnan([half.back, half.after_metres]).all()
+    assert [whole.back, whole.after_metres] == pytest.approx([0, 10e-3])
 
 
 @pytest.mark.slow
@@ -143,8 +136,7 @@ def test_the_command_judges_a_short_render_and_goes_on_where_it_was(tmp_path: Pa
     monkeypatch.setitem(recordings.RENDERED, "room", (160, 120))
     monkeypatch.setitem(inertial_benchmark.FRAMES, "room", 45)
     monkeypatch.setitem(inertial_benchmark._STARTS, "room", (26,))
-    monkeypatch.setattr(inertial_benchmark, "SECONDS", (0.5,))
-    monkeypatch.setattr(inertial_benchmark, "FAULTS", 1)
+    monkeypatch.setattr(inertial_benchmark, "_STRETCHES", ((0.0,), (0.2, 0.5)))
     monkeypatch.setattr(recording_jobs, "run_jobs", run_here)
     words = ["benchmark", "inertial", "--out", str(tmp_path / "page.md"), "--runs", str(tmp_path / "runs")]
     words += ["--seeds", "1", "--first-seed", "8", "--worlds", "room"]
@@ -152,7 +144,6 @@ def test_the_command_judges_a_short_render_and_goes_on_where_it_was(tmp_path: Pa
     assert done.exit_code == 0, done.output
     page = (tmp_path / "page.md").read_text()
     assert "| room | 0.5 | both sensors | 1 | 10 |" in page
-    assert "| deg/s | 1 |" in page
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("*.json")}
     assert len(kept) == 6
     assert CliRunner().invoke(app, words).exit_code == 0

@@ -35,27 +35,23 @@ class DarkCase:
 
     Attributes:
         method: one of `METHODS`.
-        seconds: of darkness; 0: none.
+        marks: seconds of darkness after which it is judged, as many as it lasts at last; 0: none.
         first: number of the first dark frame.
     """
 
     method: str
-    seconds: float = 0.0
+    marks: tuple[float, ...] = (0.0,)
     first: int = 0
 
     @property
     def name(self) -> str:
         """Of its result."""
-        return f"{self.method.replace(' ', '_')}-{self.seconds:g}s-{self.first}"
-
-    def count(self, frames: Sequence[DrivenFrame]) -> int:
-        """Dark frames."""
-        return round(self.seconds / interval(frames))
+        return f"{self.method.replace(' ', '_')}-{self.marks[-1]:g}s-{self.first}"
 
 
 @dataclass(frozen=True, slots=True)
 class DarkResult:
-    """What became of a run; NaN where there is nothing to judge.
+    """What became of a run up to a mark; NaN where there is nothing to judge.
 
     Attributes:
         dark, inertial, lost: dark frames, and those of them called `inertial`, and `lost` or `starting`.
@@ -64,7 +60,8 @@ class DarkResult:
         end_metres, end_degrees: error of the motion from the last frame before the dark to its last frame.
         end_sigmas: length of the last dark frame's position error under the covariance of its pose since the keyframe.
         after_metres: error of the motion from the last frame before the dark to the first one that is back.
-        nees: of the pose since the keyframe per degree of freedom, mean over the dark; without dark over all frames.
+        nees, place_nees: of the pose since the keyframe and of its position per degree of freedom, mean over the dark;
+            without dark over all frames.
         states: NEES per degree of freedom of `STATES`, likewise; empty without an inertial sensor or its truth.
         tilt, tilt_sigma: error of gravity's direction and its standard deviation, degrees, at the end.
         ate: root mean square position error of all frames, metres.
@@ -75,13 +72,14 @@ class DarkResult:
     dark: int
     inertial: int
     lost: int
-    lost_after: int
-    back: int
+    lost_after: float
+    back: float
     end_metres: float
     end_degrees: float
     end_sigmas: float
     after_metres: float
     nees: float
+    place_nees: float
     states: dict[str, float] = field(default_factory=dict)
     tilt: float = float("nan")
     tilt_sigma: float = float("nan")
@@ -111,50 +109,61 @@ class _Tracked:
     cpu: float
 
 
-def run_dark(good: GoodFrames, case: DarkCase, seed: int) -> DarkResult:
-    """Tracks a recording as the case says and judges it.
+def run_dark(good: GoodFrames, case: DarkCase, seed: int) -> list[DarkResult]:
+    """Tracks a recording as the case says and judges it at each of its marks.
 
     Args:
         good: all frames; of a run with darkness those long after it are left out.
         case: what to do.
         seed: of the noise of dark images.
     """
-    count, first = case.count(good.frames), case.first
-    frames = blacken(good.frames, first, count, np.random.default_rng(seed))
-    if count:
-        frames = frames[: first + count + _AFTER]
+    rate, first = 1.0 / interval(good.frames), case.first
+    counts = [round(seconds * rate) for seconds in case.marks]
+    frames = blacken(good.frames, first, counts[-1], np.random.default_rng(seed))
+    if counts[-1]:
+        frames = frames[: first + counts[-1] + _AFTER]
     imu = None if case.method == METHODS[0] else good.imu
     if imu is not None and case.method == METHODS[1]:
         imu = replace(imu, sensor=replace(imu.sensor, has_accelerometer=False))
     tracked = list(_track(frames, good, imu))
-    statuses = [each.status for each in tracked]
-    dark = range(first, first + count)
-    judged = dark if count else range(1, len(tracked))
-    with_images = [each.cpu for k, each in enumerate(tracked) if k not in dark]
-    known = next((k for k, each in enumerate(tracked) if each.is_inertial), None)
+    return [_judge(tracked, good, range(first, first + count), count == counts[-1]) for count in counts]
+
+
+def _judge(tracked: Sequence[_Tracked], good: GoodFrames, dark: range, is_last: bool) -> DarkResult:
+    """What became of a run after those dark frames; what comes after them only where images come."""
+    statuses, missing = [each.status for each in tracked], float("nan")
+    judged = dark if len(dark) else range(1, len(tracked))
     states = [_state_errors(tracked[k], good, k) for k in judged]
-    lost = ("lost", "starting")
-    back = next((k for k in range(dark.stop, len(tracked)) if statuses[k] not in (*lost, "inertial", "skipped")), None)
-    motions = {k: _motion_error(tracked, good, first - 1, k) for k in (dark.stop - 1, back) if count and k is not None}
-    end = motions.get(dark.stop - 1, np.full(6, np.nan))
-    after = np.full(6, np.nan) if back is None else motions.get(back, np.full(6, np.nan))
+    errors = [_pose_sigmas(tracked[k], good, k) for k in judged]
+    lost, end, after, lost_after, back = ("lost", "starting"), np.full(6, np.nan), missing, missing, missing
+    if len(dark):
+        end = _motion_error(tracked, good, dark.start - 1, dark.stop - 1)
+    if is_last:
+        lost_after = sum(status in lost for status in statuses[dark.stop :]) if len(dark) else statuses.count("lost")
+        kinds = (*lost, "inertial", "skipped")
+        number = next((k for k in range(dark.stop, len(tracked)) if statuses[k] not in kinds), None)
+        back = -1 if number is None else number - dark.stop
+        if number is not None and len(dark):
+            after = float(np.linalg.norm(_motion_error(tracked, good, dark.start - 1, number)[:3]))
+    known = next((k for k, each in enumerate(tracked) if each.is_inertial), None)
     return DarkResult(
-        dark=count,
+        dark=len(dark),
         inertial=sum(statuses[k] == "inertial" for k in dark),
         lost=sum(statuses[k] in lost for k in dark),
-        lost_after=sum(status in lost for status in statuses[dark.stop :]) if count else statuses.count("lost"),
-        back=-1 if back is None else back - dark.stop,
+        lost_after=lost_after,
+        back=back,
         end_metres=float(np.linalg.norm(end[:3])),
         end_degrees=float(np.degrees(np.linalg.norm(end[3:]))),
-        end_sigmas=_pose_sigmas(tracked[dark.stop - 1], good, dark.stop - 1)[0] if count else float("nan"),
-        after_metres=float(np.linalg.norm(after[:3])),
-        nees=_mean([_pose_sigmas(tracked[k], good, k)[1] for k in judged]),
+        end_sigmas=errors[-1][0] if len(dark) else missing,
+        after_metres=after,
+        nees=_mean([each for _, each in errors]),
+        place_nees=_mean([each**2 / 3.0 for each, _ in errors]),
         states={name: _mean([each[name] for each in states if each]) for name in STATES} if any(states) else {},
-        tilt=states[-1].get("tilt", float("nan")),
-        tilt_sigma=states[-1].get("tilt sigma", float("nan")),
+        tilt=states[-1].get("tilt", missing),
+        tilt_sigma=states[-1].get("tilt sigma", missing),
         ate=_ate(tracked, good),
-        cpu=1e3 * _mean(with_images),
-        known=float("nan") if known is None else frames[known].timestamp - frames[0].timestamp,
+        cpu=1e3 * _mean([each.cpu for k, each in enumerate(tracked) if k not in dark]),
+        known=missing if known is None else good.frames[known].timestamp - good.frames[0].timestamp,
     )
 
 

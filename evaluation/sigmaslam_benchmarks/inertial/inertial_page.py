@@ -1,13 +1,11 @@
 """The page of the benchmark `inertial`."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sigmaslam_benchmarks.inertial.dark_runs import BOUND, METHODS, STATES, DarkCase, DarkResult
-from sigmaslam_benchmarks.inertial.table_faults import TABLE_FAULTS, FaultResult
+from sigmaslam_benchmarks.inertial.dark_runs import BOUND, METHODS, STATES, DarkResult
 from sigmaslam_benchmarks.live.recordings import Recording
 from sigmaslam_benchmarks.tracking.page import fill_page, number, number_with_error
 from sigmaslam_evaluation.metrics.map_consistency import mean_with_error
@@ -24,37 +22,37 @@ class InertialPage:
     """What the page is made of.
 
     Attributes:
-        seconds: of darkness.
-        runs: results by recording and case.
-        faults: what was said of faulty and good tables, with the recordings.
-        missing: number of results that were asked for and are not there.
+        runs: results by recording, method, first dark frame and seconds of darkness.
+        missing: number of runs that were asked for and are not there.
     """
 
     command: str
-    seconds: Sequence[float]
-    runs: Mapping[tuple[Recording, DarkCase], DarkResult]
-    faults: Sequence[tuple[Recording, FaultResult]]
+    runs: Mapping[tuple[Recording, str, int, float], DarkResult]
     missing: int = 0
 
     @property
     def kinds(self) -> list[str]:
         """Worlds with a result."""
-        return list(dict.fromkeys(recording.kind for recording, _ in self.runs))
+        return list(dict.fromkeys(recording.kind for recording, *_ in self.runs))
+
+    @property
+    def seconds(self) -> list[float]:
+        """Of darkness."""
+        return sorted({seconds for *_, seconds in self.runs if seconds})
 
     def results(self, kind: str, method: str, seconds: float) -> list[DarkResult]:
-        """Of all recordings of a world; of all of them without a world's name."""
+        """Of all recordings of a world."""
         return [
             result
-            for (recording, case), result in self.runs.items()
-            if recording.kind == kind and (case.method, case.seconds) == (method, seconds)
+            for (recording, *case), result in self.runs.items()
+            if recording.kind == kind and (case[0], case[2]) == (method, seconds)
         ]
 
 
 def format_page(page: InertialPage) -> str:
     """The page as Markdown."""
     goals, missed = _goals(page)
-    recordings = dict.fromkeys(recording for recording, _ in page.runs)
-    faulty = [(recording, each) for recording, each in page.faults if each.kind]
+    recordings = dict.fromkeys(recording for recording, *_ in page.runs)
     return fill_page(
         "inertial",
         page.command,
@@ -66,13 +64,9 @@ def format_page(page: InertialPage) -> str:
         method=_SENSORS,
         bound=f"{BOUND:g}",
         dark=list(_dark_rows(page)),
+        back=list(_back_rows(page)),
         light=list(_light_rows(page)),
         states=list(_state_rows(page)),
-        faults=list(_fault_rows(page)),
-        drawn=len(faulty),
-        unnamed=[(recording.name, each.words, _said(each)) for recording, each in faulty if not each.named],
-        alarms=[(recording.name, _said(each)) for recording, each in page.faults if not each.kind and each.said],
-        good=sum(not each.kind for _, each in page.faults),
     )
 
 
@@ -90,10 +84,12 @@ def _goals(page: InertialPage) -> tuple[list[list[str]], list[str]]:
     if second:
         lost, end = sum(each.lost + each.lost_after for each in second), [each.end_metres for each in second]
         nees, middle = _mean(second, "nees"), float(np.median(end))
-        judge("MH_01, 1 s: frames lost", "0", str(lost), not lost)
+        judge("MH_01, 1 s: frames lost", "0", f"{lost:.0f}", not lost)
         judge("MH_01, 1 s: largest error, m", f"{_MH01_METRES}", f"{max(end):.3f}", max(end) <= _MH01_METRES)
         judge("MH_01, 1 s: median error, m", f"{_MH01_MEDIAN}", f"{middle:.3f}", middle <= _MH01_MEDIAN)
         judge("MH_01, 1 s: NEES in the dark", "0.5 - 2", f"{nees:.2f}", _MH01_NEES[0] <= nees <= _MH01_NEES[1])
+        place = _mean(second, "place_nees")
+        judge("MH_01, 1 s: NEES of the position", "0.5 - 2", f"{place:.2f}", _MH01_NEES[0] <= place <= _MH01_NEES[1])
     light, without = (page.results("mh01", method, 0.0) for method in (_SENSORS, _IMAGES))
     if light and without:
         ate, cpu = light[0].ate, light[0].cpu / without[0].cpu
@@ -104,15 +100,12 @@ def _goals(page: InertialPage) -> tuple[list[list[str]], list[str]]:
     if dark:
         share = float(np.mean([each.end_sigmas <= BOUND for each in dark]))
         judge(f"renders, 2 s: ends within {BOUND:g} sigma", f"{_WITHIN:.0%}", f"{share:.0%}", share >= _WITHIN)
-    for name in STATES:
-        values = [each.states.get(name, np.nan) for kind in rendered for each in page.results(kind, _SENSORS, 0.0)]
+    light = [each for kind in rendered for each in page.results(kind, _SENSORS, 0.0)]
+    for name in ("pose", *STATES):
+        values = [each.states.get(name, each.nees if name == "pose" else np.nan) for each in light]
         if np.isfinite(values).any():
             nees = float(np.nanmean(values))
             judge(f"renders with images: NEES of {name}", "0.7 - 1.4", f"{nees:.2f}", 0.7 <= nees <= 1.4)
-    faulty = [each for _, each in page.faults if each.kind]
-    if faulty:
-        named = sum(each.named for each in faulty)
-        judge("faulty tables that are named", "all", f"{named} of {len(faulty)}", named == len(faulty))
     return rows, missed
 
 
@@ -123,23 +116,37 @@ def _dark_rows(page: InertialPage) -> Iterator[list[str]]:
                 results = page.results(kind, method, seconds)
                 if not results:
                     continue
-                end, after = ([getattr(each, name) for each in results] for name in ("end_metres", "after_metres"))
-                back = [each.back for each in results]
                 yield [
                     kind,
                     f"{seconds:g}",
                     method,
                     str(len(results)),
                     *(str(sum(getattr(each, name) for each in results)) for name in ("dark", "inertial", "lost")),
-                    str(sum(each.dark - each.inertial - each.lost for each in results)),
-                    str(sum(each.lost_after for each in results)),
-                    f"{np.mean(np.array(back) == 0):.0%}" + (f", {back.count(-1)} never" if -1 in back else ""),
-                    *_median_and_worst(end, ".3f"),
+                    *_median_and_worst([each.end_metres for each in results], ".3f"),
                     f"{np.median([each.end_degrees for each in results]):.2f}",
-                    *_median_and_worst(after, ".3f"),
                     f"{np.mean([each.end_sigmas <= BOUND for each in results]):.0%}",
-                    number_with_error(*mean_with_error([each.nees for each in results]), ".2f"),
+                    *(
+                        number_with_error(*mean_with_error([getattr(each, name) for each in results]), ".2f")
+                        for name in ("nees", "place_nees")
+                    ),
                 ]
+
+
+def _back_rows(page: InertialPage) -> Iterator[list[str]]:
+    for kind in page.kinds:
+        for seconds in page.seconds:
+            for method in METHODS:
+                results = [each for each in page.results(kind, method, seconds) if np.isfinite(each.back)]
+                back = [each.back for each in results]
+                if results:
+                    yield [
+                        kind,
+                        f"{seconds:g}",
+                        method,
+                        *(str(count) for count in (len(back), back.count(0), back.count(-1))),
+                        f"{sum(each.lost_after for each in results):.0f}",
+                        *_median_and_worst([each.after_metres for each in results], ".3f"),
+                    ]
 
 
 def _light_rows(page: InertialPage) -> Iterator[list[str]]:
@@ -150,7 +157,7 @@ def _light_rows(page: InertialPage) -> Iterator[list[str]]:
                     kind,
                     method,
                     str(len(results)),
-                    str(sum(each.lost_after for each in results)),
+                    f"{sum(each.lost_after for each in results):.0f}",
                     *_median_and_worst([1e3 * each.ate for each in results], ".2f"),
                     number_with_error(*mean_with_error([each.nees for each in results]), ".2f"),
                     f"{_mean(results, 'cpu'):.0f}",
@@ -176,14 +183,6 @@ def _state_rows(page: InertialPage) -> Iterator[list[str]]:
                 ]
 
 
-def _fault_rows(page: InertialPage) -> Iterator[list[str]]:
-    for kind in TABLE_FAULTS:
-        results = [each for _, each in page.faults if each.kind == kind]
-        if results:
-            named, said = (sum(map(bool, flags)) for flags in ([r.named for r in results], [r.said for r in results]))
-            yield [kind, str(len(results)), str(named), str(said)]
-
-
 def _median_and_worst(values: Sequence[float], form: str) -> tuple[str, str]:
     known = [value for value in values if np.isfinite(value)]
     return (format(float(np.median(known)), form), format(max(known), form)) if known else ("-", "-")
@@ -192,9 +191,3 @@ def _median_and_worst(values: Sequence[float], form: str) -> tuple[str, str]:
 def _mean(results: Sequence[DarkResult], name: str) -> float:
     values = [getattr(each, name) for each in results if np.isfinite(getattr(each, name))]
     return float(np.mean(values)) if values else float("nan")
-
-
-def _said(result: FaultResult) -> str:
-    # A page does not name folders of the machine that made it.
-    said = [re.sub(r"\S*/imu0/", "imu0/", line) for line in result.said]
-    return " / ".join(said).replace("|", "\\|").replace("\n", " ") or "nothing"

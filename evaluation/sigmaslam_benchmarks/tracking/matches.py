@@ -15,10 +15,10 @@ from sigmaslam_benchmarks.matching.image_pairs import ImagePair, Motion, SameRow
 from sigmaslam_benchmarks.matching.judgement import judge_homographies, judge_rows
 from sigmaslam_benchmarks.matching.rejection import KEYPOINTS, compare_rejection
 from sigmaslam_benchmarks.matching.relative_pose import compare_starts
+from sigmaslam_benchmarks.matching.repeated_pairs import RepeatedPairs
 from sigmaslam_benchmarks.matching.sets import check_sets, load_advances, load_set
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from sigmaslam_synthetic.homography_pairs import HomographyPair
-from sigmaslam_synthetic.repeated_pairs import RepeatedPairs
 from sigmaslam_synthetic.scene_pairs import ScenePair, ScenePairs
 from sigmaslam_training.matching.match_sets import DETECTORS, SIZE
 

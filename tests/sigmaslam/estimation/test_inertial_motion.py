@@ -203,6 +203,21 @@ def test_late_samples_are_left_out_and_said_once(caplog):
     assert caplog.text.count("not later than the last one") == 1
 
 
+@pytest.mark.long
+def test_a_blow_is_said_and_leaves_the_mounting_less_certain(caplog):
+    flights = [Flight(3), Flight(3)]
+    for flight in flights:
+        flight.fly(40)
+    hit = int(np.searchsorted(flights[0].samples.timestamp, flights[0].frame * FRAME + 0.02))
+    flights[0].samples.accel[hit] += 30.0
+    with caplog.at_level(logging.WARNING):
+        for flight in flights:
+            flight.fly(1)
+    assert caplog.text.count("felt a blow at") == 1
+    hurt, well = (np.sqrt(np.diag(flight.filter.state.covariance)[19:25]) for flight in flights)
+    assert (hurt > 1.2 * well).all()
+
+
 def test_images_widen_pose_and_velocity_alone_and_can_be_taken_back():
     flight = Flight(5)
     flight.fly(40)

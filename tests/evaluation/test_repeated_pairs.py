@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam_synthetic import repeated_pairs
+from sigmaslam_benchmarks.matching import repeated_pairs
+from sigmaslam_benchmarks.matching.repeated_pairs import RepeatedPairs
 from sigmaslam_synthetic.camera.sensor import Sensor
-from sigmaslam_synthetic.repeated_pairs import RepeatedPairs
 
 SIZE = 128
 

@@ -1,0 +1,41 @@
+"""Gravity in a second of poses: found where its length agrees as well as it is known."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sigmaslam.estimation.inertial_alignment import Alignment, align
+from sigmaslam.estimation.preintegration import preintegrate
+from sigmaslam.geometry.inertial_sensor import InertialSamples
+from sigmaslam.geometry.se3 import se3_exp
+from tests.support.inertial import GRAVITY, SENSOR, Motion
+
+TIMES = 0.05 * np.arange(20)
+
+
+def align_noisy(seed: int, force: float = 1.0) -> tuple[Alignment | None, np.ndarray]:
+    """By poses that are off by 2 mm, the sensor's force being scaled, and the true gravity's part in it."""
+    rng, motion = np.random.default_rng(seed), Motion(seed, size=0.1)
+    exact = motion.measure(np.arange(-0.02, 1.2, 0.005))
+    samples = InertialSamples(exact.timestamp, exact.gyro, force * exact.accel)
+    sigma = np.repeat([2e-3, 5e-4], 3)
+    poses = np.array([se3_exp(sigma * rng.normal(size=6)) @ pose for pose in motion.poses(TIMES)])
+    motions = [
+        preintegrate(samples, start, end, np.zeros(3), np.zeros(3), SENSOR, np.zeros(2))
+        for start, end in pairwise(TIMES)
+    ]
+    assert all(motions)
+    return align(poses, np.eye(4), motions, np.full(7, 1e-6)), GRAVITY
+
+
+@pytest.mark.long
+def test_gravity_is_refused_for_its_length_only_where_noise_does_not_explain_it():
+    squared = []
+    for seed in range(30):
+        found, gravity = align_noisy(seed)
+        assert found is not None
+        error, P = found.gravity - gravity, found.covariance[3:6, 3:6]
+        squared.append(error @ np.linalg.pinv(P, 1e-6) @ error / 2)
+        assert align_noisy(seed, 1.0 / 9.81)[0] is None  # in g
+    assert np.mean(squared) < 1.5
