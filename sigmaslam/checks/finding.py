@@ -13,6 +13,7 @@ _CAUSES_FIRST = (
     "exposure",
     "light",
     "sharpness",
+    "lines",
     "same image",
     "mirrored",
     "overlap",

@@ -20,6 +20,9 @@ _WARN_BLUR = 2.0
 _MAX_LIGHT = 2.0
 # Images are one and the same where they differ by less than the noise of two cameras, grey values.
 _SAME = 0.5
+# Differences of neighbouring lines over those of every other one: 0.56 to 0.68 in seven recordings, 0.95 in noise of 25
+# grey values, 1.3 to 4 where fields are interlaced, 2.5 to 23 where the pixels of a line have colours in turn.
+_MAX_ALTERNATION = 1.15
 EYES = ("left", "right")
 
 
@@ -29,7 +32,7 @@ def check_images(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Finding
     Args:
         pairs: left and right (H, W) uint8 images.
     """
-    return [_check_exposure(pairs), _check_sharpness(pairs), _check_same(pairs)]
+    return [_check_exposure(pairs), _check_sharpness(pairs), _check_lines(pairs), _check_same(pairs)]
 
 
 def _check_exposure(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
@@ -113,6 +116,28 @@ def _check_sharpness(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
         "focus, clean the lens, move slowly, expose for a shorter time, or use smaller images"
     )
     return Finding("sharpness", "warning", message, blur)
+
+
+def _check_lines(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
+    """Whether rows are of two moments, or pixels of several colours, in turn."""
+    rows, columns = (
+        max(float(np.median([_alternation(turn(pair[eye])) for pair in pairs])) for eye in range(2))
+        for turn in (np.asarray, np.transpose)
+    )
+    figure = f"neighbouring rows differ {rows:.2f} times as much as every other one"
+    if rows <= _MAX_ALTERNATION:
+        return Finding("lines", "ok", figure, rows)
+    what = (
+        "interlaced video, whose even and odd rows are of two moments: deinterlace it, or keep every other row"
+        if columns <= _MAX_ALTERNATION
+        else "the raw mosaic of a colour sensor: convert it to colour or grey"
+    )
+    return Finding("lines", "warning", f"{figure}: {what}", rows)
+
+
+def _alternation(image: np.ndarray) -> float:
+    values = image.astype(np.int16)
+    return float(np.abs(values[1:] - values[:-1]).mean() / max(np.abs(values[2:] - values[:-2]).mean(), 1e-3))
 
 
 def _check_same(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:

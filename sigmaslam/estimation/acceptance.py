@@ -43,6 +43,8 @@ class Acceptance:
         even_sharpness: of the least sharp direction of an image, over the sharpest; below it motion has blurred it.
         streak_sharpness: of the least sharp direction, per squared pixel of half the image; stripes have more.
         noise_contrast: variance between blocks of an image by that of white noise of its pixels; scenes have more.
+        stands: pixels; landmarks of a camera that stands depart by less from where they were, others by thrice that.
+        changed_image: share of the variance of most of the image that has changed; from there on the scene has moved.
         least_sharpness: share of what keyframes saw; bounds by how much a blurred frame is less certain.
         usual_clustering: factor on variances; nine of ten quiet frames stay below, above it one frame is believed.
         scattered_nis: NIS per degree of freedom; a blurred view above it would spoil what comes after, as a keyframe.
@@ -82,6 +84,8 @@ class Acceptance:
     even_sharpness: float = 0.38
     streak_sharpness: float = 0.09
     noise_contrast: float = 2.0
+    stands: float = 0.5
+    changed_image: float = 0.1
     least_sharpness: float = 0.1
     usual_clustering: float = 2.0
     scattered_nis: float = 1.6

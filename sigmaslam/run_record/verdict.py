@@ -78,6 +78,11 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
             f"The rig changed at {summary['doubts'][Doubt.RIG]['first']:.1f} s: the right camera was bumped or turned. "
             "Its calibration was learned anew from there: calibrate again."
         )
+    if Doubt.FIXED in said:
+        said[Doubt.FIXED] = (
+            f"From {summary['doubts'][Doubt.FIXED]['first']:.1f} s on landmarks stay in the image while others move, "
+            "and draw poses along: dots of a projector (switch it off), a reflection, dirt, or the vehicle (--mask)."
+        )
     return list(said.values())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -75,8 +76,8 @@ def check_region(region: Any, camera: StereoCamera) -> None:
         raise InputError("region is false everywhere: pixels of the body must be true")
 
 
-def check_frame(left: Any, right: Any, timestamp: Any, before: float | None) -> None:
-    """A stereo pair and its time.
+def check_frame(left: Any, right: Any, timestamp: Any, before: float | None) -> float:
+    """A stereo pair and its time, in seconds.
 
     Args:
         left, right: images; their size is checked where they are rectified.
@@ -88,21 +89,21 @@ def check_frame(left: Any, right: Any, timestamp: Any, before: float | None) -> 
     """
     check_grey(left, "left image")
     check_grey(right, "right image")
-    if (
-        not isinstance(timestamp, int | float | np.number)
-        or isinstance(timestamp, bool)
-        or not math.isfinite(timestamp)
-    ):
+    is_number = isinstance(timestamp, Real) and not isinstance(timestamp, bool | np.timedelta64)
+    try:
+        seconds = float(timestamp) if is_number else math.nan
+    except OverflowError:
+        seconds = math.inf
+    if not math.isfinite(seconds):
         raise _wrong("timestamp", timestamp, "seconds as a finite number")
-    if before is None:
-        return
-    if timestamp <= before:
-        raise InputError(f"time stamp {timestamp:.6f} s does not come after {before:.6f} s: sort the frames by time")
-    if timestamp - before > _LONGEST_PAUSE:
+    if before is not None and seconds <= before:
+        raise InputError(f"time stamp {seconds:.6f} s does not come after {before:.6f} s: sort the frames by time")
+    if before is not None and seconds - before > _LONGEST_PAUSE:
         raise InputError(
-            f"time stamp {timestamp:.6f} s comes {timestamp - before:.3g} s after the one before: give seconds, not "
+            f"time stamp {seconds:.6f} s comes {seconds - before:.3g} s after the one before: give seconds, not "
             "nano- or microseconds; after a pause of days make a new tracker"
         )
+    return seconds
 
 
 def check_mask(mask: Any, width: int, height: int) -> None:

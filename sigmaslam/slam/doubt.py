@@ -18,6 +18,7 @@ class Doubt(StrEnum):
     RIG = "rig changed"
     TIME = "image of another time"
     MOTIONS = "two motions"
+    FIXED = "fixed in the image"
 
 
 @dataclass(slots=True)

@@ -20,6 +20,8 @@ _BLOCK = 8
 _VARIED = 0.1
 # Grey values: no sensor is noisier in the dark.
 _MOST_NOISE = 32.0
+# Cells that are compared, down and across, and two sides of blocks in them, pixels.
+_CELLS, _SIDES = (6, 8), (2, 8)
 
 
 class LastPairs:
@@ -34,13 +36,15 @@ class LastPairs:
 
         A torn image shows two moments, and the scene has one pose in each. Several old ones in a row are no driver's
         fault but a recording that is played back and forth. An image of one grey value alone says nothing: a covered
-        camera gives it again and again. The pair becomes the last.
+        camera gives it again and again, and so does a part that is in all of them, as a panel of text. The pair becomes
+        the last.
 
         Args:
             left, right: (H, W) uint8.
         """
         pair = _Probed(left), _Probed(right)
-        same = [any(map(_shows, pair, other)) for other in self._pairs]
+        panels = [_rows_in_all(one, [other[eye] for other in self._pairs]) for eye, one in enumerate(pair)]
+        same = [any(map(_shows, pair, other, panels)) for other in self._pairs]
         self._pairs.append(pair)
         is_last, is_old = bool(same and same[-1]), any(same[:-1])
         is_repeated = is_last or (is_old and not self._was_old)
@@ -64,6 +68,29 @@ def is_noise(image: np.ndarray) -> bool:
     return bool(is_possible and tall * broad * between < ACCEPTANCE.noise_contrast * within)
 
 
+def shows_motion(before: np.ndarray, now: np.ndarray) -> bool:
+    """Whether most of an image (H, W) uint8 has changed, whatever noise and light do, though some of it may stay.
+
+    Gain and offset of each cell are fitted. What they leave is white where it is noise: means of blocks have less.
+    """
+    changes, contrasts = [], []
+    for side in _SIDES:
+        size = tuple(cells * (length // (cells * side)) for cells, length in zip(_CELLS, now.shape, strict=True))
+        if min(size) < min(_CELLS) * 4:
+            return False
+        cells = [
+            cv2.resize(each, size[::-1], interpolation=cv2.INTER_AREA).astype(np.float32) for each in (before, now)
+        ]
+        one, other = (each.reshape(_CELLS[0], size[0] // _CELLS[0], _CELLS[1], -1) for each in cells)
+        one, other = (each - each.mean(axis=(1, 3), keepdims=True) for each in (one, other))
+        contrasts.append((other**2).mean(axis=(1, 3)))
+        shared = (one * other).mean(axis=(1, 3)) ** 2 / np.maximum((one**2).mean(axis=(1, 3)), 1e-3)
+        changes.append(contrasts[-1] - shared)
+    scene, changed = (4 * coarse > fine for fine, coarse in (contrasts, changes))
+    changed &= scene & (changes[1] > ACCEPTANCE.changed_image * contrasts[1])
+    return bool(2 * changed.sum() > scene.sum() > 0)
+
+
 class _Probed:
     """A copy of an image (H, W) uint8, for callers may fill the same array again, and some of its rows as bytes."""
 
@@ -73,11 +100,21 @@ class _Probed:
         self.rows = [row.tobytes() for row in self.pixels[:: self.step]]
 
 
-def _shows(image: _Probed, other: _Probed) -> bool:
-    """Whether an eighth of the image or more, in rows one below another, is as in another one, to the byte."""
+def _rows_in_all(image: _Probed, others: list[_Probed]) -> np.ndarray:
+    """(P,) bool, which of the rows are in all of the others, where some rows are not."""
+    same = np.array([[one == row for one, row in zip(other.rows, image.rows, strict=False)] for other in others])
+    in_all = same.all(axis=0)
+    return in_all & ~in_all.all()
+
+
+def _shows(image: _Probed, other: _Probed, panel: np.ndarray) -> bool:
+    """Whether an eighth of the image or more, in rows one below another, is as in another one, to the byte.
+
+    Rows of a panel, (P,) bool, are left out.
+    """
     if image.pixels.shape != other.pixels.shape:
         return False
-    same = [one == another for one, another in zip(image.rows, other.rows, strict=True)]
+    same = [one == another and not fixed for one, another, fixed in zip(image.rows, other.rows, panel, strict=True)]
     for probe, pair in enumerate(pairwise(same)):
         if not all(pair):
             continue

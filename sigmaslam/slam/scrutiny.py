@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.constant_velocity import dead_reckoning
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
@@ -14,13 +15,18 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, transform_points
 from sigmaslam.slam.doubt import Doubt, Doubts
+from sigmaslam.slam.frozen_images import shows_motion
 from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.moving_region import MovingRegion
 from sigmaslam.slam.second_motion import SecondMotion, find_second_motion
+from sigmaslam.two_view.stereo_pose import MIN_POINTS
 
 # So many bodies, or parts of one, are left out of an image one by one.
 _MOST_MOVERS = 3
+# Frames after one with landmarks that are fixed in the image: they have spoilt the map.
+_SPOILT = 20
 
 
 class Scrutiny:
@@ -42,6 +48,8 @@ class Scrutiny:
         self._T_rival_fit = np.eye(4)
         self._last_error = 0.0
         self._input_is_wrong = input_is_wrong
+        self._before: tuple[np.ndarray, ...] | None = None
+        self._fixed_for = 0
 
     def doubt(self, left: np.ndarray, matches: GuidedMatches, fit: FrameFit) -> tuple[GuidedMatches, FrameFit, Doubts]:
         """What speaks against a pose, before motion and map learn from it, and the pose without what is found to be
@@ -68,6 +76,8 @@ class Scrutiny:
             doubts.add(Doubt.INPUT)
         for index in np.flatnonzero(self._window.exceeded).tolist():
             doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
+        if self._is_fixed(left, matches, fit):
+            doubts.add(Doubt.FIXED)
         self._doubt_prediction(doubts, fit)
         if second is not None and not second.is_mover and not self._is_other(second, fit):
             self._take_rival(matches, fit, second)
@@ -100,6 +110,31 @@ class Scrutiny:
     def _add(self, region: MovingRegion, matches: GuidedMatches, fit: FrameFit, second: SecondMotion) -> None:
         points = transform_points(fit.pose, self._window.camera.triangulate(second.expected))
         region.add(matches.views.measurement[second.agreeing, :2], points, second.departure)
+
+    def _is_fixed(self, left: np.ndarray, matches: GuidedMatches, fit: FrameFit) -> bool:
+        """Whether landmarks that agree with the pose stay where they were in an earlier image, though they should move.
+
+        Or all stay, the camera stands by its pose, and most of the image has changed.
+        """
+        rows, seen = matches.views.landmark, matches.views.measurement[:, :2]
+        ids = self._window.landmarks.id[rows]
+        if self._before is not None:
+            image, pose, old_ids, old_seen = self._before
+            _, now, then = np.intersect1d(ids, old_ids, return_indices=True)
+            ways = seen_from(self._window, rows, pose)[:, :2] - seen_from(self._window, rows, fit.pose)[:, :2]
+            ways = np.linalg.norm(ways, axis=1)
+            moved = float(np.nanmedian(ways)) if np.isfinite(ways).any() else 0.0
+            if moved < ACCEPTANCE.stands:
+                return shows_motion(image, left)
+            if moved < 3.0 * ACCEPTANCE.stands:
+                return self._fixed_for > 0
+            moves = ways[now] > 3.0 * ACCEPTANCE.stands
+            stays = moves & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
+            # Where all stay a loop has moved the world.
+            is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves.sum()
+            self._fixed_for = _SPOILT if is_fixed else max(self._fixed_for - 1, 0)
+        self._before = left.copy(), fit.pose, ids, seen
+        return self._fixed_for > 0
 
     def _is_other(self, second: SecondMotion, fit: FrameFit) -> bool:
         """Whether a sensor of motion rules the second motion out, and not the pose."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -107,7 +108,7 @@ class StereoTracker:
         odometry: OdometrySensor | None = None,
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
-        self.config = config = config or TrackerConfig()
+        self._turn, self.config = Lock(), (config := config or TrackerConfig())
         self.rectifier = StereoRectifier(camera)
         self._camera = rectified = self.rectifier.rectified
         self._T_rectified_left = self.rectifier.T_rectified_left
@@ -179,11 +180,12 @@ class StereoTracker:
             InputError: the time stamp is no finite number, or does not increase.
             FrameError: an image or the mask has the wrong type or size, or the mask leaves nothing.
         """
-        check_frame(left, right, timestamp, self._course.timestamp)
-        usable = None if mask is None else usable_pixels(mask, self.rectifier)
         # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
-        with self._blas.limit(limits=1, user_api="blas"):
-            return self._step(left, right, timestamp, usable)
+        with self._turn, self._blas.limit(limits=1, user_api="blas"):
+            seconds = check_frame(left, right, timestamp, self._course.timestamp)
+            usable = None if mask is None else usable_pixels(mask, self.rectifier)
+            # Drivers fill their buffers again.
+            return self._step(np.array(left), np.array(right), seconds, usable)
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from sigmaslam.bounded_files import shorten
 from sigmaslam.source_commit import describe_source
-from sigmaslam_benchmarks.tracking.page import header, opening, row, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from tests.faults.case import Case, Runner, Verdict, judge
 from tests.faults.running import attempt, run_in_process, run_in_this_process
 from tests.faults.table import CASES
@@ -72,32 +72,30 @@ def write_limits(path: Path, results: list[Result], command: str) -> str:
     before = Counter(result.case.first for result in tried)
     after = Counter(result.verdict for result in tried)
     groups = Counter(result.case.group for result in results)
-    lines = [
-        *opening("Reliability and known limits", command, f": {counts[Verdict.GOOD]} of {len(results)} faults pass."),
-        "",
-        "Each fault is put into a good input: the demo that ships with the package, or a real drive. The program",
-        "must name it, with the exit code of usage.md, and lose no pose. The rules are in `tests/faults/case.py`:",
-        "",
-        "- **good**: exit code and message are as expected; where a fault does no harm, every pose is within three of",
-        "  its own sigmas of the truth;",
-        "- **unclear**: another exit code or message;",
-        "- **crash or loss**: a traceback, no end, or fewer poses than there were;",
-        "- **silent wrong**: a success that does not name the fault, poses beyond three sigmas or without a variance.",
-        "",
-        *header("", *Verdict, numbers_from=1),
-        row("all faults", *(str(counts[verdict]) for verdict in Verdict)),
-        row(f"{len(tried)} of them, in a first trial", *(str(before[v]) for v in Verdict)),
-        row("these, now", *(str(after[verdict]) for verdict in Verdict)),
-        "",
-        "Faults by group: " + ", ".join(f"{group} {count}" for group, count in groups.items()) + ".",
-        "",
-        *header("group", "fault that is not good", "verdict", "exit code", "message"),
+    missed = [
+        (each.case.group, each.case.name, each.verdict, str(each.code), _cell(each.said))
+        for each in results
+        if each.verdict != Verdict.GOOD
     ]
-    for result in results:
-        if result.verdict != Verdict.GOOD:
-            said = result.said.replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
-            lines.append(row(result.case.group, result.case.name, result.verdict, str(result.code), said))
-    return write_page(path, "\n".join(lines) + "\n")
+    page = fill_page(
+        "faults",
+        command,
+        good=counts[Verdict.GOOD],
+        results=results,
+        verdicts=list(Verdict),
+        counts=[
+            ("all faults", *(str(counts[verdict]) for verdict in Verdict)),
+            (f"{len(tried)} of them, in a first trial", *(str(before[verdict]) for verdict in Verdict)),
+            ("these, now", *(str(after[verdict]) for verdict in Verdict)),
+        ],
+        groups=[f"{group} {count}" for group, count in groups.items()],
+        missed=missed,
+    )
+    return write_page(path, page)
+
+
+def _cell(said: str) -> str:
+    return said.replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.faults.__main__ import Result, write_limits
 from tests.faults.case import Case, Outcome, Verdict, judge
 from tests.faults.running import attempt, run_in_this_process
 from tests.faults.table import CASES
@@ -39,6 +40,17 @@ def test_the_table_covers_what_was_found_in_the_first_trial():
     assert first[Verdict.SILENT] >= 23
     assert first[Verdict.LOSS] >= 20
     assert first[Verdict.UNCLEAR] >= 15
+
+
+def test_the_page_counts_what_is_good_and_quotes_the_rest(tmp_path: Path):
+    page = tmp_path / "limits.md"
+    page.write_text("old\n<!-- notes -->\nkept\n")
+    results = [Result(GOOD, Verdict.GOOD, 2, ""), Result(replace(GOOD, name="other"), Verdict.SILENT, 0, "a | b")]
+    text = write_limits(page, results, "python -m tests.faults")
+    assert text == page.read_text()
+    assert "1 of 2 faults pass" in text
+    assert "| all faults | 1 | 0 | 0 | 1 |\n" in text
+    assert text.endswith("| test | other | silent wrong | 0 | a \\| b |\n<!-- notes -->\nkept\n")
 
 
 # ---- the rules of the verdict

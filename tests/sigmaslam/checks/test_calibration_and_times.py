@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from sigmaslam.checks.calibration import check_calibration
+from sigmaslam.checks.finding import Finding
 from sigmaslam.checks.images import blur_radius, check_images
 from sigmaslam.checks.time_stamps import check_time_stamps
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -109,6 +111,23 @@ def test_images_that_differ_by_less_than_noise_are_the_same():
     noisy = np.clip(left + rng.normal(scale=3.0, size=left.shape), 0, 255).astype(np.uint8)
     assert {each.name: each.severity for each in check_images([(left, left.copy())])}["same image"] == "error"
     assert {each.name: each.severity for each in check_images([(left, noisy)])}["same image"] == "ok"
+
+
+def test_interlaced_images_and_raw_mosaics_are_named_and_noise_is_not():
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.normal(0.0, 900.0, (120, 160)), (0, 0), 4.0) + 128.0
+    interlaced, mosaic = image.copy(), image.copy()
+    interlaced[1::2] = np.roll(image, 3, axis=1)[1::2]
+    mosaic[::2, ::2] *= 0.7
+
+    def found(scene: np.ndarray, noise: float) -> Finding:
+        pair = [np.clip(scene + rng.normal(0.0, noise, scene.shape), 0, 255).astype(np.uint8) for _ in range(2)]
+        return next(each for each in check_images([(pair[0], pair[1])]) if each.name == "lines")
+
+    assert (found(image, 1.0).severity, found(image, 25.0).severity) == ("ok", "ok")
+    assert found(0.0 * image, 0.0).severity == "ok"
+    assert "deinterlace" in found(interlaced, 1.0).message
+    assert "mosaic" in found(mosaic, 1.0).message
 
 
 def test_stamps_of_a_host_are_named():

@@ -59,6 +59,10 @@ def test_a_large_offset_is_named_however_uncertain_its_scale_makes_it():
     )
 
 
+def test_landmarks_that_stay_in_the_image_have_a_cure():
+    assert "--mask" in doubts_verdict({"doubts": {Doubt.FIXED: {"frames": 3, "first": 1.0}}})[0]
+
+
 @pytest.mark.parametrize(("frames", "points"), [(3, 1000), (100, 22)])
 def test_few_frames_or_points_say_nothing(frames: int, points: int):
     assert "too early" in verdict(0.9, 0.04, frames=frames, points=points)

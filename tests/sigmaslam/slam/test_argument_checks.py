@@ -1,7 +1,10 @@
 """Arguments of another type, shape or value give one error of ours that names them and says what to give."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -53,7 +56,22 @@ def test_an_image_of_another_size_is_refused(tracker: StereoTracker):
         tracker.step(IMAGE[:50], IMAGE, 0.0)
 
 
-@pytest.mark.parametrize("timestamp", [None, "0.1", float("nan"), float("inf"), True, [1.0], np.zeros(1), 1j])
+@pytest.mark.parametrize(
+    "timestamp",
+    [
+        None,
+        "0.1",
+        float("nan"),
+        float("inf"),
+        True,
+        [1.0],
+        np.zeros(1),
+        1j,
+        np.complex64(1),
+        np.timedelta64(1),
+        10**400,
+    ],
+)
 def test_times_that_are_no_numbers_are_refused(tracker: StereoTracker, timestamp: Any):
     with pytest.raises(InputError, match=r"^timestamp is .*: give seconds as a"):
         tracker.step(IMAGE, IMAGE, timestamp)
@@ -61,7 +79,39 @@ def test_times_that_are_no_numbers_are_refused(tracker: StereoTracker, timestamp
 
 @pytest.mark.parametrize("timestamp", [1, np.float32(1.5), np.int64(2), 1e9])
 def test_times_of_any_kind_of_number_are_taken(timestamp: Any):
-    check_frame(IMAGE, IMAGE, timestamp, None)
+    assert type(check_frame(IMAGE, IMAGE, timestamp, None)) is float
+
+
+def test_a_buffer_that_is_filled_again_and_whole_seconds_change_nothing(demo_sequence: Path, frames: list[StereoFrame]):
+    plain, reusing = (StereoTracker(open_sequence(demo_sequence).camera, "klt") for _ in range(2))
+    left, right = np.empty_like(IMAGE), np.empty_like(IMAGE)
+    for second, frame in enumerate(frames):
+        expected = plain.step(frame.left, frame.right, float(second))
+        left[:], right[:] = frame.left, frame.right
+        found = reusing.step(left, right, np.int64(second))
+        left[:], right[:] = 0, 0
+        np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
+        assert found.status == expected.status
+
+
+def test_pairs_that_come_from_several_threads_are_taken_one_by_one(demo_sequence: Path, frames: list[StereoFrame]):
+    tracker = StereoTracker(open_sequence(demo_sequence).camera, "klt")
+    held, step = Event(), tracker._step
+
+    def wait(*arguments: Any) -> Any:
+        held.wait(30.0)
+        return step(*arguments)
+
+    with mock.patch.object(tracker, "_step", side_effect=wait) as slow, ThreadPoolExecutor(2) as pool:
+        first = pool.submit(tracker.step, frames[0].left, frames[0].right, 0.0)
+        while not slow.called:
+            pass
+        second = pool.submit(tracker.step, frames[1].left, frames[1].right, 0.05)
+        with pytest.raises(TimeoutError):
+            second.result(0.1)
+        assert slow.call_count == 1
+        held.set()
+        assert [first.result().status, second.result().status] == ["starting", "tracking"]
 
 
 def test_a_refused_frame_leaves_the_tracker_as_it_was(demo_sequence: Path, frames: list[StereoFrame]):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.slam.frozen_images import LastPairs, is_noise
+from sigmaslam.slam.frozen_images import LastPairs, is_noise, shows_motion
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.estimates import Demo
 
@@ -37,6 +38,47 @@ def test_an_eighth_of_an_old_image_is_enough_and_white_rows_say_nothing():
     assert not pair.is_repeated(new, new)
     newer[133:] = new[133:]
     assert pair.is_repeated(old ^ 1, newer)
+
+
+def test_a_panel_below_all_images_is_no_old_image():
+    new = np.random.default_rng(1).integers(1, 256, (9, 160, 30), np.uint8)
+    new[:, 120:] = new[0, 120:]
+    pairs = LastPairs()
+    assert not any(pairs.is_repeated(image, image ^ 1) for image in new)
+    assert pairs.is_repeated(new[-1], new[0])
+
+
+def test_a_scene_that_moves_behind_what_stays_is_seen_and_noise_and_light_are_none(demo: Demo):
+    rng, scene, later = np.random.default_rng(0), demo[1][0].left, demo[1][6].left
+    fixed = cv2.GaussianBlur(rng.normal(0.0, 100.0, scene.shape), (0, 0), 0.8)
+
+    def seen(image: np.ndarray, noise: float, gain: float = 1.0) -> np.ndarray:
+        return np.clip(gain * image + fixed + rng.normal(0.0, noise, image.shape), 0, 255).astype(np.uint8)
+
+    assert shows_motion(seen(scene, 2.0), seen(later, 2.0))
+    assert not shows_motion(seen(scene, 2.0), seen(scene, 2.0))
+    assert not shows_motion(seen(scene, 25.0), seen(scene, 25.0, 0.8))
+    assert not shows_motion(scene[:20, :20], later[:20, :20])
+
+
+@pytest.mark.long
+def test_dots_of_a_projector_make_poses_doubtful_and_a_camera_that_stands_does_not(demo: Demo):
+    camera, frames, _ = demo
+    rng = np.random.default_rng(5)
+    dots = np.zeros((240, 360))
+    dots[rng.integers(0, 240, 1280), rng.integers(0, 360, 1280)] = 480.0
+    dots = cv2.GaussianBlur(dots, (0, 0), 0.8)
+    with_dots, standing = StereoTracker(camera), StereoTracker(camera)
+    for frame in frames[:8]:
+        pair = [
+            np.clip(0.6 * image + dots[:, x : x + 320], 0, 255) for image, x in ((frame.left, 0), (frame.right, 12))
+        ]
+        lit = with_dots.step(pair[0].astype(np.uint8), pair[1].astype(np.uint8), frame.timestamp)
+        pair = [np.clip(x + rng.normal(0, 2, x.shape), 0, 255) for x in (frames[0].left, frames[0].right)]
+        still = standing.step(pair[0].astype(np.uint8), pair[1].astype(np.uint8), frame.timestamp)
+        assert still.status in ("starting", "tracking")
+    assert lit.status == "doubtful"
+    assert "fixed in the image" in lit.doubts
 
 
 def test_noise_is_no_scene(demo: Demo):
