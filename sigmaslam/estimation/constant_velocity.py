@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.sample_buffer import SampleBuffer
-from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log
 from sigmaslam.inference.backends import load_step
 
 # Order of the graph's error state, see sigmaslam_models.estimator.pose_prediction.
@@ -124,6 +124,11 @@ class MotionFilter:
         self.widen(1.0 / self.widened)
         self._covariance[_POSE, _POSE] += np.outer(error, error)
         return error
+
+    def go_back(self, seconds: float, widened: float = 1.0) -> None:
+        """Predicts an earlier moment, no more certain than the later one, and widened by so much."""
+        self.widen(widened / self.widened)
+        self.step = se3_exp(-self.way(seconds)) @ self.step
 
     def way(self, seconds: float) -> np.ndarray:
         """(6,) what the velocity makes of the pose in that time, perturbed from the left in the keyframe."""

@@ -68,6 +68,8 @@ class Scrutiny:
             doubts.add(Doubt.INPUT)
         for index in np.flatnonzero(self._window.exceeded).tolist():
             doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
+        if matches.rival is not None:
+            doubts.add_motion(matches.rival, fit.pose)
         self._doubt_prediction(doubts, fit)
         if second is not None and not second.is_mover and not self._is_other(second, fit):
             self._take_rival(matches, fit, second)
