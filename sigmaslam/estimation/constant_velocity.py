@@ -125,10 +125,14 @@ class MotionFilter:
         self._covariance[_POSE, _POSE] += np.outer(error, error)
         return error
 
-    def go_back(self, seconds: float, widened: float = 1.0) -> None:
-        """Predicts an earlier moment, no more certain than the later one, and widened by so much."""
-        self.widen(widened / self.widened)
+    def go_back(self, seconds: float) -> None:
+        """Predicts an earlier moment, no more certain than the later one, and no longer widened."""
+        self.widen(1.0 / self.widened)
         self.step = se3_exp(-self.way(seconds)) @ self.step
+
+    def restore(self, state: MotionState, widened: float) -> None:
+        """Takes an earlier state of constant velocity back, to the bit."""
+        self.step, self.twist, self._covariance, self.widened = state.step, state.twist, state.covariance, widened
 
     def way(self, seconds: float) -> np.ndarray:
         """(6,) what the velocity makes of the pose in that time, perturbed from the left in the keyframe."""

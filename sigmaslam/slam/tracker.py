@@ -52,7 +52,7 @@ from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
 from sigmaslam.slam.rig_change import RigChange, RigWatch
 from sigmaslam.slam.scrutiny import Scrutiny
-from sigmaslam.slam.set_clock import follow_either
+from sigmaslam.slam.set_clock import follow_either, localise_either
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
@@ -275,14 +275,13 @@ class StereoTracker:
             change = None if fit is not None else self._rig_watch.find_change(frame, matches, prediction)
             if fit is not None or change is not None:
                 return matches, fit, change
-            prediction = Prediction.of(self._window, self._motion)
         view = frame.view
         clock.lap("features")
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
         if frame.is_exchanged(keyframes[-1].stereo_count if keyframes else 0, self.config.min_inliers):
             doubts.add(Doubt.EYES)
             return GuidedMatches.empty(), None, None
-        return *self._localiser.localise(view, keyframes, prediction, guided, clock), None
+        return *localise_either(self._localiser, view, keyframes, guided, clock), None
 
     def _correct(self, fit: FrameFit, blur: float, matches: GuidedMatches, timestamp: float) -> FrameFit:
         """Takes a pose over, less certain where the frame is blurred."""

@@ -208,12 +208,14 @@ def test_two_loops_that_agree_outweigh_a_covariance_that_is_too_small():
 
 @pytest.mark.slow
 def test_a_closed_loop_is_not_taken_for_a_wrong_calibration(real_data: Path):
-    """Keyframes of a flight that returns: poses jump with the loop, and views of before say nothing of a rig by it."""
+    """Poses jump with the loop; where those of the evidence stay, an offset of 3.6 px is believed from frame 32 on."""
     folder = real_data / "euroc_v1_01_keyframes_a"
     sequence = open_sequence(folder)
     tracker = StereoTracker(sequence.camera)
     estimates = [tracker.step(each.left, each.right, each.timestamp) for each in sequence.frames()]
+    assert sum(each.loop is not None for each in estimates) > 5
     assert not any(Doubt.OFFSET in each.doubts for each in estimates)
+    assert all(cause.probability < 0.5 for cause in tracker._window.evidence.weigh().values())
     found = [each for each in estimates if each.has_pose]
     path = Trajectory(np.array([each.timestamp for each in found]), np.array([each.T_world_camera for each in found]))
     truth = read_trajectory(folder / "groundtruth.csv")

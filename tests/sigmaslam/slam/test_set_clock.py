@@ -11,7 +11,7 @@ from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.localisation import Prediction
-from sigmaslam.slam.set_clock import follow_either
+from sigmaslam.slam.set_clock import follow_either, localise_either
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.estimates import Demo, track
@@ -49,13 +49,13 @@ def test_of_two_times_the_one_that_the_image_shows_is_taken(tracked: tuple[Stere
 
 def test_where_neither_time_gives_a_pose_the_prediction_spans_both(tracked: tuple[StereoTracker, Frame, np.ndarray]):
     tracker, _, _ = tracked
-    black = Frame(*np.zeros((2, 240, 320), np.uint8), tracker._frontend)
+    black = Frame(*np.zeros((2, 240, 320), np.uint8), tracker._frontend).view
     motion = tracker._motion
     motion.set_twist(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.full(6, 1e-3))
     motion.predict(0.5, np.full(2, 1e-4))
     step, tracker._clock.late = motion.step, 0.5
-    prediction = Prediction.of(tracker._window, motion)
-    assert follow_either(tracker._localiser, black, tracker._keyframes.active, prediction, Stopwatch())[1] is None
+    views = [each.view for each in tracker._keyframes.active]
+    assert localise_either(tracker._localiser, black, views, True, Stopwatch())[1] is None
     np.testing.assert_allclose(motion.step, step, atol=1e-12)
     assert motion.step_covariance[0, 0] == pytest.approx(0.25, rel=0.1)
 
