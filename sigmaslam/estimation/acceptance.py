@@ -52,6 +52,7 @@ class Acceptance:
         keyframe_points: times the least inliers, of stereo points; most of them are lost until the next keyframe.
         start_stereo_share: of the keypoints seen by both eyes; with less a first keyframe may be of one eye alone.
         swapped_share: of the disparities behind infinity; no offset puts more there, swapped eyes do.
+        exchanged_share: of the last keyframe's disparities; with less the eyes are tried the other way round.
         swapped_disparity: pixels; a lesser disparity is behind infinity whatever the offset.
     """
 
@@ -94,6 +95,7 @@ class Acceptance:
     start_stereo_share: float = 0.25
     swapped_share: float = 0.1
     swapped_disparity: float = -1.0
+    exchanged_share: float = 0.25
 
 
 ACCEPTANCE = Acceptance()

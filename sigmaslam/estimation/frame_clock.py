@@ -22,6 +22,8 @@ _MOST_DROPPED = 4
 _TAKES_TURNS = 0.75
 # Seconds. A slower camera's frames were chosen, and a host is late by less; the motion in between is unknown anyway.
 _SLOWEST = 0.5
+# Times the usual interval, from which on frames may be missing or the clock have been set; flow tells less.
+_SET = 2.5
 # Of the mean interval: no two frames of a camera are closer.
 _LEAST_STEP = 0.1
 
@@ -60,11 +62,12 @@ class FrameClock:
 
     Attributes:
         was_believed: stamps before the last one were taken as they are.
+        late: seconds by which the last interval is longer than usual, if the clock may have been set in it, or 0.
     """
 
     def __init__(self) -> None:
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
-        self.was_believed, self._is_believed = True, True
+        self.was_believed, self._is_believed, self.late = True, True, 0.0
 
     @property
     def interval(self) -> float:
@@ -77,6 +80,8 @@ class FrameClock:
         Returns:
             The time between the two frames, and its standard deviation, seconds.
         """
+        usual = float(np.median(self._intervals)) if len(self._intervals) >= _LEAST else np.inf
+        self.late = interval - usual if _SET * usual < interval and usual <= _SLOWEST else 0.0
         self._intervals.append(interval)
         steps = np.array(self._intervals)
         noise = stamp_noise(steps) if len(steps) >= _LEAST else _first_noise(steps)

@@ -20,6 +20,8 @@ MAX_DISPARITY = 0.25
 _ABOVE, _TALL, _BEFORE, _BROAD = 5, 11, 8, 16
 # The best place must have less than this share of the difference of the second best one.
 _MAX_RATIO = 0.9
+# Times the contrast of the other eye, from which on its light differs, and not what it sees.
+_EQUAL_LIGHT = 1.25
 # Disparities that count as neighbours of the best one, and by how many the way back may miss.
 _NEIGHBOURS, _MAX_MISS = 2, 1
 # Stands for no disparity: below all that are searched in images narrower than 8,000 pixels.
@@ -40,7 +42,7 @@ def search_rows(left: np.ndarray, right: np.ndarray, keypoints: np.ndarray) -> t
         (M,) which keypoints were found, and (M, 2) float64 where, to a pixel or two along the row.
     """
     scale = 2 if left.shape[1] >= _HALVED_FROM else 1
-    edges = _edges(left, scale), _edges(right, scale)
+    edges = _alike(_derivative(left, scale), _derivative(right, scale))
     places = np.rint((keypoints + 0.5) / scale - 0.5).astype(np.int32)
     most = int(MAX_DISPARITY * left.shape[1] / scale)
     kernels = compiled()
@@ -114,8 +116,19 @@ def _differences(image0: np.ndarray, image1: np.ndarray, places: np.ndarray, shi
     return sums
 
 
-def _edges(image: np.ndarray, scale: int) -> np.ndarray:
-    """Horizontal derivative of an image shrunk by a whole factor, (H / scale, W / scale) uint8 about 128."""
+def _derivative(image: np.ndarray, scale: int) -> np.ndarray:
+    """Along the rows, of an image shrunk by a whole factor, (H / scale, W / scale) int16."""
     if scale > 1:
         image = cv2.resize(image, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
-    return cv2.convertScaleAbs(cv2.Sobel(image, cv2.CV_16S, 1, 0), alpha=0.5, beta=128.0)
+    return cv2.Sobel(image, cv2.CV_16S, 1, 0)
+
+
+def _alike(*derivatives: np.ndarray) -> list[np.ndarray]:
+    """Derivatives (H, W) of two eyes as uint8 about 128; those of an eye with far less light are raised."""
+    strength = np.array([max(float(cv2.meanStdDev(each)[1][0, 0]), 1.0) for each in derivatives])
+    gain = strength.max() / strength
+    gain = np.where(gain > _EQUAL_LIGHT, gain, 1.0)
+    return [
+        cv2.convertScaleAbs(each, alpha=0.5 * factor, beta=128.0)
+        for each, factor in zip(derivatives, gain.tolist(), strict=True)
+    ]

@@ -83,6 +83,12 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
             f"From {summary['doubts'][Doubt.FIXED]['first']:.1f} s on landmarks stay in the image while others move, "
             "and draw poses along: dots of a projector (switch it off), a reflection, dirt, or the vehicle (--mask)."
         )
+    if Doubt.EYES in said:
+        eyes = summary["doubts"][Doubt.EYES]
+        said[Doubt.EYES] = (
+            f"From {eyes['first']:.1f} s on, in {eyes['frames']} frames, the left image is of the right eye: they have "
+            "no pose. Does the driver number the cameras anew?"
+        )
     return list(said.values())
 
 

@@ -16,6 +16,7 @@ class Doubt(StrEnum):
     INPUT = "eyes do not fit"
     OFFSET = "offset too large"
     RIG = "rig changed"
+    EYES = "eyes exchanged"
     TIME = "image of another time"
     MOTIONS = "two motions"
     FIXED = "fixed in the image"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 
 import cv2
 import numpy as np
 
+from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.frontend import Frontend, StereoView
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.argument_checks import check_mask
@@ -23,20 +25,39 @@ class Frame:
         left, right: (H, W) uint8, rectified.
         frontend: detects features.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
+        exchange: gives left and right as they are if each image is the other eye's.
     """
 
     def __init__(
-        self, left: np.ndarray, right: np.ndarray, frontend: Frontend, usable: np.ndarray | None = None
+        self,
+        left: np.ndarray,
+        right: np.ndarray,
+        frontend: Frontend,
+        usable: np.ndarray | None = None,
+        exchange: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> None:
         self.left = left
         self.right = right
         self.usable = usable
         self._view = Deferred(lambda: frontend.observe(left, right).within(usable))
+        self._exchanged = lambda: frontend.observe(*(exchange() if exchange else (right, left)))
 
     @property
     def view(self) -> StereoView:
         """The pair with its features and their disparities."""
         return self._view.get()
+
+    def is_exchanged(self, usual: int, min_to_judge: int) -> bool:
+        """Whether each image is the other eye's: hardly a disparity as they are, and many the other way round.
+
+        Args:
+            usual: features of the last keyframe with a disparity.
+            min_to_judge: as of `StereoView.is_swapped`, by which some cameras show it at once.
+        """
+        enough = ACCEPTANCE.exchanged_share * usual
+        if self.view.is_swapped(min_to_judge) or self.view.stereo_count >= enough:
+            return self.view.is_swapped(min_to_judge)
+        return self._exchanged().stereo_count > max(2 * self.view.stereo_count, enough)
 
     def foresee(self, executor: Executor) -> None:
         """Begins to make the view beside the tracking of the frame."""

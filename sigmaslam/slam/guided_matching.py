@@ -41,12 +41,14 @@ class GuidedMatches:
         probability: (M,) that each match is right.
         searched: (S,) rows of those that were searched for.
         streaked: motion has blurred either the view or one of the keyframes.
+        rival: (4, 4) another pose that nearly as many matches agree with; None: there is none.
     """
 
     views: LandmarkViews
     probability: np.ndarray
     searched: np.ndarray
     streaked: bool = False
+    rival: np.ndarray | None = None
 
     @classmethod
     def empty(cls) -> GuidedMatches:

@@ -78,6 +78,8 @@ class Scrutiny:
             doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
         if self._is_fixed(left, matches, fit):
             doubts.add(Doubt.FIXED)
+        if matches.rival is not None:
+            doubts.add_motion(matches.rival, fit.pose)
         self._doubt_prediction(doubts, fit)
         if second is not None and not second.is_mover and not self._is_other(second, fit):
             self._take_rival(matches, fit, second)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -52,6 +53,7 @@ from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
 from sigmaslam.slam.rig_change import RigChange, RigWatch
 from sigmaslam.slam.scrutiny import Scrutiny
+from sigmaslam.slam.set_clock import follow_either, localise_either
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
@@ -189,7 +191,8 @@ class StereoTracker:
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
-        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
+        exchange = partial(self.rectifier.rectify, right, left)
+        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable, exchange)
         clock.lap("rectify")
         if self._course.timestamp is not None:
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
@@ -198,9 +201,9 @@ class StereoTracker:
                 self._motion.forget_twist(initial_twist_sigma(self.config, self._window.depth))
             self._motion.predict(seconds, densities(self.config, self._window.depth), sigma, timestamp)
         is_repeated = self._last_pairs.is_repeated(left, right)
-        matches, fit, change = GuidedMatches.empty(), None, None
+        matches, fit, change, doubts = GuidedMatches.empty(), None, None, Doubts()
         if not is_repeated and not is_noise(left):
-            matches, fit, change = self._localise(frame, timestamp, clock)
+            matches, fit, change = self._localise(frame, timestamp, clock, doubts)
         if fit is None and dead_reckoning(self._motion) is not None:
             # Images that give no pose say nothing against the prediction either.
             self._motion.widen(1.0 / self._motion.widened)
@@ -208,7 +211,6 @@ class StereoTracker:
         inliers = None if fit is None else fit.inliers
         self.last_frame = MatchedFrame(frame.left, frame.right, landmarks, matches, inliers)
         predicted = filtered = self._motion.state
-        doubts = Doubts()
         if fit is not None:
             matches, fit, doubts = self._scrutiny.doubt(frame.left, matches, fit)
             status = doubts.status
@@ -259,30 +261,29 @@ class StereoTracker:
         return self._keyframes.pack(self._frontend.name, self._camera)
 
     def _localise(
-        self, frame: Frame, timestamp: float, clock: Stopwatch
+        self, frame: Frame, timestamp: float, clock: Stopwatch, doubts: Doubts
     ) -> tuple[GuidedMatches, FrameFit | None, RigChange | None]:
         """Matches with the window's landmarks, and the pose if enough of them agree, or else why they do not."""
         if self._course.is_waiting:
             return GuidedMatches.empty(), None, None
-        first = self._admission.begin_again(frame, self._unguided)
-        if first is not None:
+        if (first := self._admission.begin_again(frame, self._unguided)) is not None:
             self._recovery.begin_again(first, timestamp)
         prediction = Prediction.of(self._window, self._motion)
         guided = self._course.phase is Phase.TRACKING
         if guided and self._follower.is_ready:
             if self._beside is not None and self._mapper.keyframe_is_near:
                 frame.foresee(self._beside)
-            matches, fit = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
+            matches, fit = follow_either(self._localiser, frame, self._keyframes.active, prediction, clock)
             change = None if fit is not None else self._rig_watch.find_change(frame, matches, prediction)
             if fit is not None or change is not None:
                 return matches, fit, change
-            prediction = Prediction.of(self._window, self._motion)
         view = frame.view
         clock.lap("features")
-        if view.is_swapped(self.config.min_inliers):
-            return GuidedMatches.empty(), None, None
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
-        return *self._localiser.localise(view, keyframes, prediction, guided, clock), None
+        if frame.is_exchanged(keyframes[-1].stereo_count if keyframes else 0, self.config.min_inliers):
+            doubts.add(Doubt.EYES)
+            return GuidedMatches.empty(), None, None
+        return *localise_either(self._localiser, view, keyframes, guided, clock), None
 
     def _correct(self, fit: FrameFit, blur: float, matches: GuidedMatches, timestamp: float) -> FrameFit:
         """Takes a pose over, less certain where the frame is blurred."""

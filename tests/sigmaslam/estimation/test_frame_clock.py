@@ -70,3 +70,20 @@ def test_bursts_are_no_pauses_of_a_fast_camera(size: int):
     found = np.array(steps_of(stamps))[size:]
     assert (found[:, 1] > 0.0).all()
     assert (np.abs(found[:, 0] - 0.1) < found[:, 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("intervals", "late"),
+    [
+        ([0.1] * 9 + [0.6], 0.5),
+        ([0.1] * 3 + [0.6], 0.0),  # too few to tell what is usual
+        ([0.1] * 9 + [0.2], 0.0),  # one frame is missing
+        ([0.8] * 9 + [4.0], 0.0),  # so slow a camera's frames were chosen
+        ([0.1] * 9 + [0.6, 0.1], 0.0),
+    ],
+)
+def test_a_long_interval_may_be_a_clock_that_was_set(intervals: list[float], late: float):
+    clock = FrameClock()
+    for each in intervals:
+        clock.tick(each)
+    assert clock.late == pytest.approx(late)

@@ -49,6 +49,17 @@ def test_a_shifted_image_is_found_at_its_shift_in_front_of_infinity_and_behind(p
     np.testing.assert_array_equal(places[:, 1], inner[index, 1])
 
 
+@pytest.mark.parametrize("dark", [0, 1], ids=["left", "right"])
+def test_an_eye_in_the_dark_is_searched_as_in_the_light(pair, dark: int):
+    corners = cv2.goodFeaturesToTrack(pair[0], 300, 0.01, 5.0).reshape(-1, 2)
+    index, places = search_rows(*pair, corners)
+    images = [image // 3 if eye == dark else image for eye, image in enumerate(pair)]
+    index_dark, places_dark = search_rows(*images, corners)
+    assert len(index_dark) > 0.9 * len(index) > 100
+    _, one, other = np.intersect1d(index, index_dark, return_indices=True)
+    assert (np.abs(places[one] - places_dark[other]).max(axis=1) <= 1.0).mean() > 0.97
+
+
 def test_nothing_is_found_where_there_is_no_texture_or_none_alike(pair):
     left = pair[0]
     noise = np.random.default_rng(1).integers(0, 256, left.shape).astype(np.uint8)

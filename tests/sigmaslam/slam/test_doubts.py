@@ -89,6 +89,31 @@ def test_a_torn_image_whose_rows_are_no_copies_is_doubted(demo: Demo):
     assert sum(each.status == "tracking" for each in estimates) > FRAMES // 2
 
 
+@pytest.mark.parametrize("is_exchanged", [True, False], ids=["exchanged", "right eye covered"])
+def test_exchanged_eyes_whose_rows_do_not_fit_are_told_from_a_dead_eye(demo: Demo, is_exchanged: bool):
+    """As after the rectification of each by the other's, where too few places behind infinity are found to judge."""
+    camera, frames, _ = demo
+    tracker = StereoTracker(camera)
+    track(tracker, frames[:3])
+    left, right = frames[3].left, frames[3].right
+    given = (np.roll(right, 6, axis=0), left) if is_exchanged else (left, np.zeros_like(right))
+    frame = Frame(*given, tracker._frontend, exchange=lambda: (left, right) if is_exchanged else given[::-1])
+    usual = tracker._keyframes.active[-1].view.stereo_count
+    assert frame.view.stereo_count < 0.1 * usual
+    assert frame.is_exchanged(usual, usual) is is_exchanged
+
+
+def test_exchanged_eyes_are_named_and_give_no_pose(demo: Demo):
+    estimates, _ = driven(demo, "swapped")
+    assert all(each.status == "lost" and list(each.doubts) == [Doubt.EYES] for each in estimates[FRAMES // 2 :])
+
+
+def test_an_eye_at_a_third_of_its_light_is_tracked_as_before(demo: Demo):
+    estimates, truth = driven(demo, "right_dark")
+    assert silent_wrong(estimates, truth) == []
+    assert [each.status for each in estimates[1:]] == ["tracking"] * (FRAMES - 1)
+
+
 def test_a_bump_is_said_when_it_happens_and_its_offset_is_learned(demo: Demo):
     estimates, _ = driven(demo, "columns_2")
     assert [k for k, each in enumerate(estimates) if Doubt.RIG in each.doubts] == [FRAMES // 2]

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sigmaslam.frontend.types import KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers import open_sequence
+from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.relative_poses import SPANS
 from sigmaslam.slam.tracker import StereoTracker
+from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error
 from tests.support.quantiles import chi_square_median, squared_sigmas
 from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, frame_of, run_simulated
 
@@ -198,3 +204,19 @@ def test_two_loops_that_agree_outweigh_a_covariance_that_is_too_small():
     assert surprise > 5.0
     assert left < 0.2 * off
     assert then < 3.0
+
+
+@pytest.mark.slow
+def test_a_closed_loop_is_not_taken_for_a_wrong_calibration(real_data: Path):
+    """Poses jump with the loop; where those of the evidence stay, an offset of 3.6 px is believed from frame 32 on."""
+    folder = real_data / "euroc_v1_01_keyframes_a"
+    sequence = open_sequence(folder)
+    tracker = StereoTracker(sequence.camera)
+    estimates = [tracker.step(each.left, each.right, each.timestamp) for each in sequence.frames()]
+    assert sum(each.loop is not None for each in estimates) > 5
+    assert not any(Doubt.OFFSET in each.doubts for each in estimates)
+    assert all(cause.probability < 0.5 for cause in tracker._window.evidence.weigh().values())
+    found = [each for each in estimates if each.has_pose]
+    path = Trajectory(np.array([each.timestamp for each in found]), np.array([each.T_world_camera for each in found]))
+    truth = read_trajectory(folder / "groundtruth.csv")
+    assert absolute_trajectory_error(path, truth).rmse < 0.04
