@@ -1,0 +1,1 @@
+"""Training of the stereo network on pairs of our own making."""
