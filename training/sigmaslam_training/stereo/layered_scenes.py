@@ -1,7 +1,7 @@
 """Stereo pairs of layers: slanted planes and curved sheets before one another, any number at once, on a GPU as well.
 
 A layer is a disparity, a mask and a texture as functions of the left image's plane. Every pixel of an eye takes the
-nearest layer there; in the right eye's the place in the left image's plane is found by iterations of x = x_r + d(x, y).
+nearest layer there; in the right eye the place in the left image's plane is found by Newton's steps.
 Disparities are exact, and so is what is hidden.
 """
 
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 _LAYERS = (6, 14)
 _FINE = 2  # samples along a pixel's side
-_ITERATIONS = 5
+_ITERATIONS = 3
 # Disparities of the nearest layers, pixels, drawn evenly in the logarithm; steepest change along a row.
 _NEAREST = (8.0, 185.0)
 _STEEPEST = 0.5
@@ -104,8 +104,9 @@ class LayeredScenes:
         for layer in layers:
             x = u
             if right:
+                x = u + _disparity(layer, u, v)
                 for _ in range(_ITERATIONS):
-                    x = u + _disparity(layer, x, v)
+                    x = x - (x - u - _disparity(layer, x, v)) / (1.0 - _slope(layer, x, v))
             disparity = _disparity(layer, x, v)
             seen = self._shade(layer, x, v)
             if light is None or nearest is None:
@@ -206,6 +207,15 @@ def _disparity(layer: _Layer, x: Tensor, v: Tensor) -> Tensor:
         result = result + height * torch.sin(across * x + down * v + phase)
     # Nothing is behind infinity; what would be lies there.
     return result.clamp_min(0.0)
+
+
+def _slope(layer: _Layer, x: Tensor, v: Tensor) -> Tensor:
+    """Change of the disparity along a row, pixels a pixel."""
+    x, v = x - layer.centre[0], v - layer.centre[1]
+    result = layer.along.expand_as(x)
+    for height, across, down, phase in layer.waves:
+        result = result + height * across * torch.cos(across * x + down * v + phase)
+    return result
 
 
 def _inside(layer: _Layer, x: Tensor, v: Tensor) -> Tensor:

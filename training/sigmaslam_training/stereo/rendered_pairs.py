@@ -109,7 +109,7 @@ def _open(folder: Path, size: tuple[int, int], shape: tuple[int, int, int, int])
 
 def _work(folder: Path, seed: int, size: tuple[int, int], shape: tuple[int, int, int, int], worker: int) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
-    os.nice(5)
+    os.nice(2)
     import torch
 
     from sigmaslam_synthetic.rendering.textures import paint

@@ -21,23 +21,25 @@ def stereo_loss(maps: StereoMaps, disparity: Tensor) -> tuple[Tensor, dict[str, 
         maps: of the network.
         disparity: (B, 1, H, W) pixels; NaN where it is not known.
     """
-    known = disparity.isfinite() & (disparity < _FAR)
+    known = disparity.isfinite()
     truth = torch.where(known, disparity, torch.zeros_like(disparity))
     weight = known.float()
     total = weight.sum().clamp_min(1.0)
+    # What is nearer than the steps reach is a gross error, and teaches the network to say so.
+    reached = weight * (truth < _FAR)
     error = (maps.disparity - truth).abs()
     likelihood = negative_log_likelihood(error, maps.log_scale, maps.gross)
     # Of the first disparity the places that are nearest to its grid's.
     first = (maps.half - truth[:, :, ::2, ::2]).abs()
     half = functional.huber_loss(first, torch.zeros_like(first), reduction="none", delta=2.0).clamp_max(30.0)
-    half = (half * weight[:, :, ::2, ::2]).sum() / weight[:, :, ::2, ::2].sum().clamp_min(1.0)
+    half = (half * reached[:, :, ::2, ::2]).sum() / reached[:, :, ::2, ::2].sum().clamp_min(1.0)
     middle = truth[:, 0, 1::STRIDE, 1::STRIDE] / STRIDE
     lower = middle.floor().clamp(0, LEVELS - 2)
     share = (middle - lower).clamp(0.0, 1.0)
     logs = maps.logits.float().log_softmax(dim=1)
     index = lower.long()[:, None]
     votes = -((1.0 - share) * logs.gather(1, index)[:, 0] + share * logs.gather(1, index + 1)[:, 0])
-    counted = weight[:, 0, 1::STRIDE, 1::STRIDE]
+    counted = reached[:, 0, 1::STRIDE, 1::STRIDE]
     votes = (votes * counted).sum() / counted.sum().clamp_min(1.0)
     likelihood = (likelihood * weight).sum() / total
     figures = {

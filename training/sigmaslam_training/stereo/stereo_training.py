@@ -108,7 +108,7 @@ def train_stereo(
             textures = torch.from_numpy(source.painted).to(device)
             layers = LayeredScenes(textures, config.size, generator)
             layered = _Kept(config.kept, config.size, device)
-            rendered = _Kept(min(config.kept, 4000), config.size, device)
+            rendered = _Kept(2 * config.kept, config.size, device)
             step, saved, logged, failures = 0, began, began, 0
             sums: dict[str, float | Tensor] = {}
             while (elapsed := time.monotonic() - began) < config.seconds:
