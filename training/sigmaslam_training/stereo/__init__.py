@@ -1,1 +1,0 @@
-"""Training of the stereo network on pairs of our own making."""
