@@ -35,7 +35,8 @@ def load_network(weights: Path) -> FeatureNetwork:
     Raises:
         InputError: the file is missing, not the one that its manifest names, or holds another network.
     """
-    return _load(FeatureNetwork(), weights)
+    detects = weights.is_file() and b'"response.' in weights.read_bytes()
+    return _load(FeatureNetwork(detects=detects), weights)
 
 
 def load_scorer(weights: Path) -> MatchScorer:

@@ -1,0 +1,1 @@
+"""Training of detector and descriptors together, on one GPU."""
