@@ -16,8 +16,8 @@ _SIGMA = 1.4
 # Reach of the filters, pixels: a cell and its neighbours hold it.
 _REACH = 4
 _NMS_WINDOW = 3
-MIN_RESPONSE = 1e-9
-"""Less is round-off: one grey level of 255 gives 1e-6."""
+# Less is round-off: one grey level of 255 gives 1e-6.
+_MIN_RESPONSE = 1e-9
 # Response is compared with its surroundings to this power: 0 keeps the strongest peaks wherever they crowd, 1 spreads
 # them as evenly as texture allows.
 _EVENING_POWER = 0.75
@@ -51,7 +51,8 @@ def hessian_response(cells: Tensor) -> Tensor:
     Positive on blobs, bright or dark, negative on saddles (Beaudet 1978; Lindeberg 1998). Near the border of the image
     it is meaningless.
     """
-    uu, vv, uv = functional.conv2d(cells, _HESSIAN_KERNELS.to(cells), padding=1).split(CELL * CELL, dim=1)
+    size = CELL * CELL
+    uu, vv, uv = functional.conv2d(cells, _HESSIAN_KERNELS.to(cells), padding=1).split(size, dim=1)
     return uu * vv - uv * uv
 
 
@@ -93,21 +94,18 @@ def detect(cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 def find_peaks(response: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """As `detect`, for any response (B, 16, h, w) in cells."""
-    evened = response / surroundings(response)
-    return pick_peaks(functional.pixel_shuffle(evened, CELL), functional.pixel_shuffle(response, CELL), count)
-
-
-def pick_peaks(scores: Tensor, response: Tensor, count: int, least: float = MIN_RESPONSE) -> tuple[Tensor, Tensor]:
-    """The `count` largest maxima of scores (B, 1, H, W), with sub-pixel places from a response of at least `least`."""
+    evened = response / _surroundings(response)
+    flat = functional.pixel_shuffle(response, CELL)
+    scores = functional.pixel_shuffle(evened, CELL)
     peak = functional.max_pool2d(scores, _NMS_WINDOW, stride=1, padding=_NMS_WINDOW // 2)
-    kept = torch.where((scores >= peak) & (response > least), scores, torch.zeros_like(scores))
+    kept = torch.where((scores >= peak) & (flat > _MIN_RESPONSE), scores, torch.zeros_like(scores))
     inner = kept[:, :, BORDER:-BORDER, BORDER:-BORDER]
     kept = functional.pad(inner, (BORDER, BORDER, BORDER, BORDER))
     strength, index = torch.topk(kept.flatten(1), count, dim=1)
-    return _fit_peaks(response, index), strength
+    return _fit_peaks(flat, index), strength
 
 
-def surroundings(response: Tensor) -> Tensor:
+def _surroundings(response: Tensor) -> Tensor:
     """What the response is measured against, (B, 1, h, w): its mean around a cell to a power."""
     cells = response.clamp_min(0.0).mean(dim=1, keepdim=True)
     # The outermost cells respond to the border of the image.

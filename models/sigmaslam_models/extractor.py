@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from sigmaslam_models.detector import detect, pick_peaks, to_cells, to_half_cells
-from sigmaslam_models.feature_network import SIZE_MULTIPLE, FeatureMaps, FeatureNetwork, sample_map
-from sigmaslam_models.learned_response import LEAST
+from sigmaslam_models.detector import detect, to_cells, to_half_cells
+from sigmaslam_models.feature_network import SIZE_MULTIPLE, FeatureNetwork, sample_map
 
 EXTRACTOR_SIZE_MULTIPLE = 2 * SIZE_MULTIPLE
 """Sides of the image: the network's multiple, at half size too."""
@@ -50,8 +49,8 @@ class FeatureExtractor(nn.Module):
         return keypoints[order], scores, descriptors, sigma[order]
 
     def _level(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        candidates, strength = self._detect(cells, _CANDIDATES_PER_KEYPOINT * count)
         maps = self.network(cells)
-        candidates, strength = self._detect(cells, maps, _CANDIDATES_PER_KEYPOINT * count)
         quality = sample_map(maps.quality, candidates).squeeze(-1).sigmoid()
         strength = strength / strength.amax(dim=1, keepdim=True).clamp_min(1e-12)
         sigma = sample_map(maps.log_sigma, candidates).squeeze(-1).exp()
@@ -60,11 +59,8 @@ class FeatureExtractor(nn.Module):
         descriptors = self.network.describe(maps, keypoints)
         return keypoints[0], scores[0], descriptors[0], sigma.gather(1, order)[0]
 
-    def _detect(self, cells: Tensor, maps: FeatureMaps, count: int) -> tuple[Tensor, Tensor]:
-        if self.network.response is None:
-            return detect(cells, count)
-        response = self.network.response(cells, maps.fine)
-        return pick_peaks(response, response, count, LEAST)
+    def _detect(self, cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        return detect(cells, count)
 
     def _rank(self, strength: Tensor, quality: Tensor, sigma: Tensor) -> Tensor:
         """Scores (B, N). Relative strength of the blob and learned quality count alike; of strength zero is no blob."""

@@ -7,7 +7,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sigmaslam_models.detector import CELL
-from sigmaslam_models.learned_response import LearnedResponse
 
 DESCRIPTOR_SIZE = 64
 STRIDE = 4
@@ -46,7 +45,6 @@ class FeatureNetwork(nn.Module):
     Args:
         descriptor_size: of the descriptors.
         stride: of the finest map that descriptors see: 4; 8 and 16 see the coarse one alone, 16 without its 1/8 branch.
-        detects: whether it has a response of its own; if not, the Hessian's detects.
 
     Raises:
         ValueError: the stride is none of these.
@@ -56,7 +54,7 @@ class FeatureNetwork(nn.Module):
         stride s is centred on pixel (s i + (s - 1) / 2, s j + (s - 1) / 2).
     """
 
-    def __init__(self, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE, detects: bool = False) -> None:
+    def __init__(self, descriptor_size: int = DESCRIPTOR_SIZE, stride: int = STRIDE) -> None:
         super().__init__()
         if stride not in STRIDES:
             raise ValueError(f"stride {stride} is none of {STRIDES}")
@@ -66,7 +64,6 @@ class FeatureNetwork(nn.Module):
         self.sixteenth = nn.Sequential(_block(48, 64, stride=2), _block(64, 64), _block(64, 64), _block(64, 48))
         self.merge = _block(48, _COARSE)
         self.judge = nn.Conv2d(_COARSE, 2, 1)
-        self.response = LearnedResponse(_FINE) if detects else None
         seen = _COARSE + (_WINDOW * _WINDOW * _FINE if stride == 4 else 0)
         self.describer = nn.Sequential(
             nn.Linear(seen, _HIDDEN), nn.ReLU(inplace=True), nn.Linear(_HIDDEN, descriptor_size)

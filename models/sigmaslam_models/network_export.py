@@ -35,8 +35,7 @@ def load_network(weights: Path) -> FeatureNetwork:
     Raises:
         InputError: the file is missing, not the one that its manifest names, or holds another network.
     """
-    detects = weights.is_file() and b'"response.' in weights.read_bytes()
-    return _load(FeatureNetwork(detects=detects), weights)
+    return _load(FeatureNetwork(), weights)
 
 
 def load_scorer(weights: Path) -> MatchScorer:

@@ -1,1 +1,0 @@
-"""Training of detector and descriptors together, on one GPU."""
