@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.frontend import epipolar_search
 from sigmaslam.frontend.epipolar_search import UncertainGeometry, find_epipolar_geometry, nearest_near_lines
 from sigmaslam.frontend.types import Features
+from sigmaslam.two_view.fundamental import estimate_fundamental
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 R = Rotation.from_euler("yxz", [25.0, -6.0, 4.0], degrees=True).as_matrix()
@@ -121,6 +122,8 @@ def test_matches_on_which_the_consensus_of_opencv_fails_raise_nothing():
     matches = np.array(text.split(), float).reshape(-1, 4)
     found = find_epipolar_geometry(matches[:, :2], matches[:, 2:])
     assert found is None or found.F.shape == (3, 3)
+    fitted = estimate_fundamental(matches[:, :2], matches[:, 2:], np.ones(31), np.tile(np.eye(2), (31, 1, 1)))
+    assert fitted is None or fitted.F.shape == (3, 3)
 
 
 def test_the_nearest_near_a_line_are_those_of_a_loop():
