@@ -73,7 +73,8 @@ class FeatureNetwork(nn.Module):
         """Maps of a batch of images."""
         fine = self.stem(normalize_image(cells))
         eighth = self.eighth(fine)
-        merged = _doubled(self.sixteenth(eighth))
+        deep = self.sixteenth(eighth)
+        merged = functional.interpolate(deep, scale_factor=2.0, mode="bilinear", align_corners=False)
         coarse = self.merge(merged + eighth if self.stride < 16 else merged)
         quality, log_sigma = self.judge(coarse).split(1, dim=1)
         return FeatureMaps(fine, coarse, quality, log_sigma)
@@ -137,10 +138,6 @@ def _samples(features: Tensor, keypoints: Tensor, stride: int, window: int) -> T
     cells = left + du * (right - left)
     above, below = cells[..., :-1, :, :], cells[..., 1:, :, :]
     return above + dv * (below - above)
-
-
-def _doubled(features: Tensor) -> Tensor:
-    return functional.interpolate(features, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def _block(channels_in: int, channels_out: int, stride: int = 1) -> nn.Sequential:

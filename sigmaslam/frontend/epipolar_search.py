@@ -52,7 +52,10 @@ def find_epipolar_geometry(points0: np.ndarray, points1: np.ndarray) -> Uncertai
     if len(points0) < _LEAST_MATCHES:
         return None
     points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
-    F, chosen = cv2.findFundamentalMat(points0, points1, cv2.USAC_ACCURATE, _THRESHOLD, _CONFIDENCE, _SAMPLES)
+    try:
+        F, chosen = cv2.findFundamentalMat(points0, points1, cv2.USAC_ACCURATE, _THRESHOLD, _CONFIDENCE, _SAMPLES)
+    except cv2.error:  # an assertion of OpenCV 5.0, for few sets of points
+        return None
     # OpenCV returns None on failure, although its type hints exclude None.
     if np.shape(F) != (3, 3) or chosen.sum() < _LEAST_MATCHES:
         return None

@@ -77,9 +77,11 @@ def estimate_fundamental(
     if len(probable) < _EIGHT:
         return None
     points0, points1 = points0.astype(np.float64), points1.astype(np.float64)
-    start, _ = cv2.findFundamentalMat(
-        points0[probable], points1[probable], cv2.USAC_ACCURATE, _THRESHOLD, 0.999, _SAMPLES
-    )
+    both = points0[probable], points1[probable]
+    try:
+        start, _ = cv2.findFundamentalMat(*both, cv2.USAC_ACCURATE, _THRESHOLD, 0.999, _SAMPLES)
+    except cv2.error:  # an assertion of OpenCV 5.0, for few sets of points
+        return None
     # OpenCV returns None on failure, although its type hints exclude None.
     if np.shape(start) != (3, 3):
         return None

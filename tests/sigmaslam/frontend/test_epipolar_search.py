@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.frontend import epipolar_search
 from sigmaslam.frontend.epipolar_search import UncertainGeometry, find_epipolar_geometry, nearest_near_lines
 from sigmaslam.frontend.types import Features
+from sigmaslam.two_view.fundamental import estimate_fundamental
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 R = Rotation.from_euler("yxz", [25.0, -6.0, 4.0], degrees=True).as_matrix()
@@ -104,6 +105,25 @@ def test_points_of_a_plane_leave_lines_uncertain():
 def test_few_matches_have_no_geometry(count: int):
     points0, points1 = views(np.random.default_rng(0))
     assert find_epipolar_geometry(points0[:count], points1[:count]) is None
+
+
+def test_matches_on_which_the_consensus_of_opencv_fails_raise_nothing():
+    """u0, v0, u1, v1 of matches of a render, with which an assertion of OpenCV 5.0 fails."""
+    text = """
+    351.35 83.30 197.99 67.99 354.51 102.85 197.07 81.81 352.08 68.96 200.37 58.15 361.17 67.70 205.66 59.43
+    345.70 100.78 192.43 78.69 356.53 75.50 201.98 63.69 346.14 87.50 194.51 69.76 356.16 88.81 199.95 72.72
+    365.77 59.51 209.38 54.88 351.54 106.63 194.88 83.76 343.25 70.13 195.26 56.99 351.33 92.30 196.76 74.08
+    351.18 95.47 196.24 76.21 346.06 107.61 191.68 83.31 365.47 65.39 208.37 58.84 347.31 67.92 197.83 56.34
+    347.28 72.08 197.23 59.23 370.21 66.77 210.78 60.86 365.30 65.53 208.26 58.90 351.36 97.99 195.99 77.96
+    362.17 91.07 202.99 75.47 374.72 106.02 207.43 87.54 306.19 242.65 161.58 170.85 337.56 243.53 179.34 173.46
+    344.29 277.77 179.80 189.76 241.38 298.80 289.75 208.19 307.29 246.92 162.11 173.31 367.40 279.58 189.86 190.65
+    307.24 282.57 157.85 193.13 103.08 135.88 170.09 168.11 320.57 244.43 171.53 173.22
+    """
+    matches = np.array(text.split(), float).reshape(-1, 4)
+    found = find_epipolar_geometry(matches[:, :2], matches[:, 2:])
+    assert found is None or found.F.shape == (3, 3)
+    fitted = estimate_fundamental(matches[:, :2], matches[:, 2:], np.ones(31), np.tile(np.eye(2), (31, 1, 1)))
+    assert fitted is None or fitted.F.shape == (3, 3)
 
 
 def test_the_nearest_near_a_line_are_those_of_a_loop():
