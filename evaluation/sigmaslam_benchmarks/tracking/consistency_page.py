@@ -129,7 +129,8 @@ def format_noise(
 ) -> str:
     """The page of own covariances of matches beside one for all; arguments as of `format_page`."""
     pairs = {"exact": ("ours", "one covariance"), "drawn": (f"ours, {DRAWN}", f"one covariance, {DRAWN}")}
-    rows, total = [], {calibration: ([], []) for calibration in pairs}
+    rows: list[list[str]] = []
+    total: dict[str, tuple[list[ConsistencyResult], ...]] = {calibration: ([], []) for calibration in pairs}
     for scale, methods in results.items():
         for calibration, names in pairs.items():
             own, one = (methods[name] for name in names)
