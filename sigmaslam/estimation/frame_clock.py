@@ -74,6 +74,11 @@ class FrameClock:
         """Mean of the last ones, seconds; 0 before the first."""
         return float(np.mean(self._intervals)) if self._intervals else 0.0
 
+    @property
+    def is_slow(self) -> bool:
+        """The last interval is one of frames that were chosen."""
+        return bool(self._intervals) and self._intervals[-1] > _SLOWEST
+
     def tick(self, interval: float) -> tuple[float, float]:
         """Takes the interval between two stamps, seconds.
 

@@ -166,7 +166,7 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
     covariance = end @ np.linalg.inv(information) @ end.T
     bias, covariance[6:9, 6:9] = align_gyro(bodies, motions)
     found = np.concatenate([speed @ solution + speed_known, direction * STANDARD_GRAVITY, bias, solution[unknown]])
-    return found, 0.5 * (covariance + covariance.T), abs(length - STANDARD_GRAVITY) - 3.0 * np.sqrt(spread)
+    return found, 0.5 * (covariance + covariance.T), float(abs(length - STANDARD_GRAVITY) - 3.0 * np.sqrt(spread))
 
 
 class GravitySearch:

@@ -85,6 +85,8 @@ class Localiser:
     ) -> tuple[GuidedMatches, FrameFit | None]:
         """Matches and pose of a frame without features; no pose where that is doubtful.
 
+        Nor beside a sensor after half a second: features are found by its prediction, and optical flow strays.
+
         Args:
             frame: the current one.
             keyframes: of the window.
@@ -92,6 +94,8 @@ class Localiser:
             clock: takes the time of the stages `match` and `filter`.
         """
         measured, turn = prediction, self.motion.turn
+        if turn is not None and self.frame_clock.is_slow:
+            return GuidedMatches.empty(), None
         matches, excess = self.follower.follow(frame, keyframes, prediction.pose, prediction.covariance, turn)
         if excess > 1.0:
             self.motion.widen(excess)

@@ -110,20 +110,31 @@ def test_gravity_and_biases_are_found_in_a_second():
 
 
 @pytest.mark.slow
-def test_a_dark_second_stays_within_what_is_claimed():
-    errors, nees = [], []
-    for seed in range(30):
+def test_dark_seconds_stay_within_what_is_claimed():
+    """Thirty flights, places some 0.5 m apart every half second; `pytest -s -m slow -k claimed` prints the figures."""
+    errors: dict[float, list[float]] = {0.0: [], 0.5: [], 1.0: [], 2.0: []}
+    nees: dict[float, list[dict[str, float]]] = {seconds: [] for seconds in errors}
+    within = []
+    for seed in range(811_100, 811_130):
         flight = Flight(seed, wrong=True)
-        flight.fly(60)
+        flight.fly(50)
         assert flight.filter.is_inertial
-        flight.fly(20, dark=True)
-        errors.append(np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]))
-        nees.append(list(flight.nees().values()))
-    mean = dict(zip(flight.nees(), np.mean(nees, axis=0), strict=True))
-    # Of places some 0.5 m apart every half second.
-    assert np.median(errors) < 0.04, errors
-    assert np.max(errors) < 0.1, errors
-    assert all(0.5 < each < 1.6 for each in mean.values()), mean
+        for seconds in errors:
+            flight.fly(50 + round(seconds / FRAME) - flight.frame, dark=True)
+            errors[seconds].append(float(np.linalg.norm((flight.truth - flight.filter.step)[:3, 3])))
+            nees[seconds].append(flight.nees())
+        error = se3_log(flight.truth @ se3_inverse(flight.filter.step))[:3]
+        within.append(error @ np.linalg.solve(flight.filter.step_covariance[:3, :3], error) <= 2.5**2)
+    for seconds, found in nees.items():
+        mean = {name: float(np.mean([each[name] for each in found])) for name in found[0]}
+        worst, median = max(errors[seconds]), float(np.median(errors[seconds]))
+        print(f"{seconds:g} s: median {median:.3f} m, worst {worst:.3f} m, NEES {mean}")
+        assert all(0.5 < each < 1.6 for each in mean.values()), mean
+        if seconds == 1.0:
+            assert median < 0.04
+            assert worst < 0.1
+    print(f"after 2 s {np.mean(within):.0%} within 2.5 sigma")
+    assert np.mean(within) > 0.75
 
 
 def test_at_rest_gravity_is_found_as_well():

@@ -6,9 +6,27 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Localiser, Prediction
+
+
+@pytest.mark.parametrize(("turn", "interval", "flows"), [(None, 1.0, 1), (np.eye(3), 1.0, 0), (np.eye(3), 0.1, 1)])
+def test_after_a_long_while_features_are_found_by_a_sensor_not_flow(turn, interval: float, flows: int):
+    followed = []
+
+    def follow(*args):
+        followed.append(args)
+        return GuidedMatches.empty(), 1.0
+
+    clock = FrameClock()
+    clock.tick(interval)
+    given: list[Any] = [None, Motion(turn=turn), None, None, SimpleNamespace(follow=follow)]
+    localiser = Localiser(*given, None, SimpleNamespace(min_inliers=12), clock)
+    prediction = Prediction(np.eye(4), np.eye(6))
+    assert localiser.follow(None, [], prediction, SimpleNamespace(lap=lambda name: None))[1] is None
+    assert len(followed) == flows
 
 
 class Motion(SimpleNamespace):
