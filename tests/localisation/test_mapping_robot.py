@@ -113,7 +113,7 @@ def map_while_driving(make, runs, steps, seed):
     bayes, belief = make(mapping.space), mapping.prior(start)
     deviations = np.sqrt(belief.covariance[0].diagonal().numpy())[:ROBOT_SIZE]
     pose = BODY.retract(start, torch.from_numpy(deviations[:3] * generator.normal(size=(runs, 3)))).numpy()
-    constants = deviations[3:] * generator.normal(size=(runs, 7))
+    constants = deviations[3:] * generator.normal(size=(runs, ROBOT_SIZE - 3))
     path = torch.tensor([[0.15, 0.11]], dtype=torch.float64).expand(runs, 2)
     time = torch.full((runs,), duration, dtype=torch.float64)
     number = torch.arange(5).expand(runs, 5)
@@ -140,7 +140,7 @@ def map_while_driving(make, runs, steps, seed):
 
 
 def drive_truly(mapping, pose, constants, path, duration, generator):
-    """Arcs, of a robot with constants (B, 7) as `wheeled_robot` lists them."""
+    """Arcs, of a robot with constants (B, 9) as `wheeled_robot` lists them."""
     noise = mapping.robot.noise
     distance = path[:, 0] * (1 + constants[:, 0]) + duration * constants[:, 2]
     turn = path[:, 1] * (1 + constants[:, 1]) + duration * constants[:, 3]
@@ -157,8 +157,8 @@ def drive_truly(mapping, pose, constants, path, duration, generator):
 def sense(pose, constants, places):
     offset = places - pose[:, None, :2]
     bearing = np.arctan2(offset[..., 1], offset[..., 0]) - pose[:, None, 2]
-    ahead = np.hypot(*np.moveaxis(offset, -1, 0)) * np.cos(bearing) - 0.1
-    left = np.hypot(*np.moveaxis(offset, -1, 0)) * np.sin(bearing)
+    ahead = np.hypot(*np.moveaxis(offset, -1, 0)) * np.cos(bearing) - 0.1 - constants[:, 7:8]
+    left = np.hypot(*np.moveaxis(offset, -1, 0)) * np.sin(bearing) - constants[:, 8:9]
     distance, bearing = np.hypot(ahead, left), np.arctan2(left, ahead) + constants[:, 5:6]
     return np.stack([distance * (1 + constants[:, 6:7]), bearing], axis=-1)
 

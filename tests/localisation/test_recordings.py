@@ -15,7 +15,7 @@ from sigmaslam_localisation.mrclam import read_mrclam
 from sigmaslam_localisation.starry import read_starry
 from sigmaslam_localisation.stereo_points import StereoBody
 from sigmaslam_localisation.tubes import read_tubes
-from sigmaslam_localisation.wheeled_robot import WheeledRobot
+from sigmaslam_localisation.wheeled_robot import CONSTANTS, WheeledRobot
 from tests.support.wheeled_world import World, drive, write_csv_folder
 
 
@@ -23,7 +23,7 @@ def residuals(recording):
     """Of what was seen at the true poses: (S, 2)."""
     poses = recording.truth.at(recording.seconds)
     usable = np.isfinite(poses).all(axis=1)
-    state = torch.nn.functional.pad(torch.from_numpy(poses[usable]), (0, 7))
+    state = torch.nn.functional.pad(torch.from_numpy(poses[usable]), (0, len(CONSTANTS)))
     model = WheeledRobot.of(recording).measurement()
     seen = model.function(state, torch.from_numpy(recording.landmarks[recording.landmark[usable]]))
     difference = torch.from_numpy(recording.sightings[usable]) - seen
@@ -73,7 +73,7 @@ def test_without_noise_a_recording_has_no_residuals(tmp_path):
     quiet = drive(World(seconds=3.0))
     for kind in ("range-bearing", "cartesian"):
         recording = replace(quiet, kind=kind)
-        state = torch.nn.functional.pad(torch.from_numpy(recording.truth.at(recording.seconds)), (0, 7))
+        state = torch.nn.functional.pad(torch.from_numpy(recording.truth.at(recording.seconds)), (0, len(CONSTANTS)))
         landmark = torch.from_numpy(recording.landmarks[recording.landmark])
         exact = WheeledRobot.of(recording).measurement().function(state, landmark).numpy()
         assert np.abs(residuals(replace(recording, sightings=exact))).max() < 1e-12
