@@ -54,7 +54,7 @@ def networks_in(weights: WeightsFolder, backend: str = "onnx", names: Sequence[s
     if not folder.is_dir():
         raise InputError(
             f"--weights {folder}: {'is no folder' if folder.exists() else 'does not exist'}: give one that `sigmaslam "
-            "export RUN --out FOLDER` wrote"
+            "train export RUN --out FOLDER` wrote"
         )
     found = tuple(name for name in names if network_path(name, folder, backend).parent == folder)
     if not found:

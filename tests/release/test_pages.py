@@ -28,6 +28,7 @@ NOT_RUN = {
     "sigmaslam train scorer": "half an hour",
     "sigmaslam train export": "needs what `train` makes",
     "sigmaslam benchmark": "an hour and more",
+    "sigmaslam track FOLDER --out run --resume": "the stand-in is complete",
     "sigmaslam track FOLDER --out run --start 100": "the stand-in has eight pairs",
     "sigmaslam train render street --seeds": "ten drives",
     "sigmaslam train render street --out drives": "ten drives",
@@ -106,12 +107,13 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def stand_ins(installed: dict[str, str], demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stand-ins for what the commands read, and a run."""
+    """Stand-ins for what the commands read, and two runs."""
     folder = tmp_path_factory.mktemp("empty")
     write_stand_ins(demo_sequence, folder)
     shutil.copy(folder / CALIBRATION, folder / "kept.yaml")
     subprocess.run("sigmaslam track FOLDER --out tracked --tracks", shell=True, check=True, cwd=folder, env=installed)
-    shutil.copytree(folder / "tracked", folder / "run")
+    for run in ("run", "again"):
+        shutil.copytree(folder / "tracked", folder / run)
     return folder
 
 

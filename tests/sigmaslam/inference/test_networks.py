@@ -176,7 +176,10 @@ def test_a_folder_without_use_is_refused(files: list[str], frontend: str, backen
 
 
 @pytest.mark.parametrize("words", [["track", str(DEMO)], ["match", *PAIR]], ids=lambda words: words[0])
-@pytest.mark.parametrize(("name", "message"), [("nowhere", "does not exist"), ("file", "is no folder")])
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("nowhere", "does not exist: give one that `sigmaslam train export"), ("file", "is no folder")],
+)
 def test_commands_refuse_it_before_they_write(words: list[str], name: str, message: str, tmp_path: Path):
     (tmp_path / "file").touch()
     out = tmp_path / "out.npz"
