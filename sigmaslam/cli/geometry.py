@@ -15,7 +15,7 @@ def geometry(
     image1: Annotated[Path, typer.Argument(metavar="IMAGE1", help="Another view of the scene.")],
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Calibration of the pair that took the images; without it the cameras are unknown."),
+        typer.Option(help="Of the pair that took the images, in any form; without it the cameras are unknown."),
     ] = None,
     eyes: Annotated[
         str, typer.Option(metavar="EYE,EYE", help="With --calibration: which of its cameras took which image.")

@@ -6,10 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_bytes
 from sigmaslam.frontend.image_pair import draw_lines, match_images
-from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 from sigmaslam.geometry.se3 import rotation_log
 from sigmaslam.readers.images import read_grey
@@ -115,7 +116,7 @@ def describe_files(
 
     Args:
         path0, path1: image files.
-        calibration: YAML of the stereo pair that took them; None: the geometry of uncalibrated views.
+        calibration: of the stereo pair that took them, in any form; None: the geometry of uncalibrated views.
         eyes: which of its cameras took which, "left" or "right".
         picture: PNG to draw.
         frontend, max_keypoints: of `match_images`.
@@ -124,8 +125,8 @@ def describe_files(
     """
     if picture is not None and picture.suffix != ".png":
         raise InputError(f"--picture {picture} does not end in .png: choose a name that does")
-    models, known = _cameras(calibration, eyes)
     image0, image1 = read_grey(path0), read_grey(path1)
+    models, known = _cameras(calibration, eyes, image0.shape)
     for path, image, model in zip((path0, path1), (image0, image1), models or (), strict=False):
         if image.shape != (model.height, model.width):
             raise InputError(
@@ -252,7 +253,7 @@ def _describe_pose(pose: RelativeOrientation) -> list[str]:
 
 
 def _cameras(
-    calibration: Path | None, eyes: tuple[str, str]
+    calibration: Path | None, eyes: tuple[str, str], shape: tuple[int, ...]
 ) -> tuple[tuple[CameraModel, CameraModel] | None, np.ndarray | None]:
     """The cameras, and T_1_0 where they are the two of the pair."""
     for eye in eyes:
@@ -260,7 +261,7 @@ def _cameras(
             raise InputError(f"--eyes names {eye!r}: give two of left and right, as left,right")
     if calibration is None:
         return None, None
-    pair = StereoCamera.from_yaml(calibration)
+    pair = read_calibration(calibration, (shape[1], shape[0]))
     known = None
     if eyes == ("left", "right"):
         known = np.linalg.inv(pair.T_left_right)

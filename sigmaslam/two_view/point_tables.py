@@ -19,6 +19,8 @@ from sigmaslam.two_view.triangulation import TwoViews, triangulate
 
 _PIXELS = ("u0", "v0", "u1", "v1")
 _PLACE = ("x", "y", "z")
+# Pixels; good calibrations leave less than one.
+_MOST_MISSED = 3.0
 _COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 
 
@@ -51,10 +53,25 @@ def triangulate_file(source: Path, camera: StereoCamera, out: Path, method: str,
     ]
     _write_table(out, ["id", *_PLACE, *_COVARIANCE], rows)
     depth, sigma_depth = points[usable, 2], np.sqrt(spread[usable, 2, 2])
-    return (
+    missed = int((_misses(camera, points[usable], pixels[usable]) > _MOST_MISSED).sum())
+    warning = (
+        f"{missed} of the pairs miss each other by more than {_MOST_MISSED:g} px, or lie outside of the images: "
+        "do they belong together?\n"
+    )
+    return (warning if missed else "") + (
         f"{len(rows)} points, {len(usable) - len(rows)} left out that meet nowhere before the cameras; "
         f"depth {np.median(depth):.4g} ± {np.median(sigma_depth):.2g} m in the median\nWritten: {out}"
     )
+
+
+def _misses(camera: StereoCamera, points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(N,) pixels between (N, 4), of which points (N, 3) are made, and where these are seen; infinite outside."""
+    T = se3_inverse(camera.T_left_right)
+    seen = camera.left.project(points), camera.right.project(points @ T[:3, :3].T + T[:3, 3])
+    ways = [np.linalg.norm(each - pixels[:, 2 * k : 2 * k + 2], axis=1) for k, each in enumerate(seen)]
+    sizes = [size for eye in (camera.left, camera.right) for size in (eye.width, eye.height)]
+    inside = np.logical_and(pixels > -1.0, pixels < sizes).all(axis=1)
+    return np.where(inside, np.nan_to_num(np.maximum(*ways), nan=np.inf), np.inf)
 
 
 def triangulate_pairs(

@@ -122,6 +122,18 @@ def _changed(change: Callable[..., tuple[np.ndarray, np.ndarray]], count: int = 
     return attempt
 
 
+def _fields(number: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Even and odd rows of two moments: every other row is moved as the next frame moves."""
+    return tuple(np.where(np.arange(len(eye))[:, None] % 2, np.roll(eye, 3, axis=1), eye) for eye in (left, right))
+
+
+def _panel(number: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Text below the image of an endoscope."""
+    panel = np.full_like(left[200:], 30)
+    cv2.putText(panel, "Name: DOE  12 mm  f 30  10:31", (4, 25), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 200)
+    return np.vstack([left[:200], panel]), np.vstack([right[:200], panel])
+
+
 def _with_file(break_file: Callable[[Path], object], number: int = 3, eye: str = LEFT) -> Callable[..., Outcome]:
     """One image of the sequence is replaced."""
 
@@ -335,6 +347,8 @@ IMAGE_CASES = [
         right=True,
         slow=True,
     ),
+    Case("images", "interlaced", _changed(_fields), 0, ("deinterlace",)),
+    Case("images", "a panel of text below all", _changed(_panel), 0, ("0 skipped",), poses=6, right=True),
     Case(
         "images",
         "every image of half the size",

@@ -35,8 +35,8 @@ def run(*arguments: object) -> str:
 
 
 @pytest.mark.long
-def test_the_eyes_of_a_rectified_pair_are_found_beside_each_other(calibration: Path, tmp_path: Path):
-    picture = tmp_path / "pair.png"
+def test_the_eyes_of_a_rectified_pair_are_found_beside_each_other_by_kitti_s_calibration(tmp_path: Path):
+    picture, calibration = tmp_path / "pair.png", DEMO / "calib.txt"
     printed = run(
         IMAGES[0][0], IMAGES[1][0], "--calibration", calibration, "--eyes", "left,right", "--picture", picture
     )

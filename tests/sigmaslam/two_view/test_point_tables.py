@@ -53,6 +53,20 @@ def test_exact_pixels_give_the_points(rig: StereoCamera, method: str):
     assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
 
 
+def test_pixels_that_do_not_belong_together_are_told_of(tmp_path: Path):
+    rig = RIGS["radtan"]
+    pixels = seen(rig, scene(20, seed=1))
+    calibration = write_own(rig, tmp_path)
+    for rows, away, words in ((0.0, 0.0, None), (30.0, 0.0, "1 of the pairs miss"), (0.0, 1e4, "2 of the pairs miss")):
+        pixels[4, 3] += rows
+        pixels[5, 0] += away
+        table = write_csv(tmp_path / "pixels.csv", "u0,v0,u1,v1", pixels)
+        found = run_here("images", "triangulate", table, "--calibration", calibration, "--out", tmp_path / "points.csv")
+        assert found.returncode == 0
+        assert (words or "points") in found.stdout
+        assert words or "miss" not in found.stdout
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_the_covariance_is_that_of_a_monte_carlo(method: str):
