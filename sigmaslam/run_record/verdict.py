@@ -78,8 +78,7 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
             f"The rig changed at {summary['doubts'][Doubt.RIG]['first']:.1f} s: the right camera was bumped or turned. "
             "Its calibration was learned anew from there: calibrate again."
         )
-    if Doubt.EYES in said:
-        eyes = summary["doubts"][Doubt.EYES]
+    if eyes := summary.get("doubts", {}).get(Doubt.EYES):
         said[Doubt.EYES] = (
             f"From {eyes['first']:.1f} s on, in {eyes['frames']} frames, the left image is of the right eye: they have "
             "no pose. Does the driver number the cameras anew?"

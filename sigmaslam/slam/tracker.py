@@ -189,8 +189,8 @@ class StereoTracker:
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
-        exchange = partial(self.rectifier.rectify, right, left)
-        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable, exchange)
+        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
+        frame.exchange = partial(self.rectifier.rectify, right, left)
         clock.lap("rectify")
         if self._course.timestamp is not None:
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
@@ -278,7 +278,7 @@ class StereoTracker:
         view = frame.view
         clock.lap("features")
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
-        if frame.is_exchanged(keyframes[-1].stereo_count if keyframes else 0, self.config.min_inliers):
+        if frame.is_exchanged(keyframes[-1], self.config.min_inliers):
             doubts.add(Doubt.EYES)
             return GuidedMatches.empty(), None, None
         return *localise_either(self._localiser, view, keyframes, guided, clock), None
