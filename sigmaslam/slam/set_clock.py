@@ -34,11 +34,12 @@ def by_times(localiser: Localiser, localise: Callable[[], Found]) -> Found:
     motion.go_back(late)
     earlier = Prediction.of(localiser.window, motion)
     others, other, _ = localise()
-    is_same = fit is not None and other is not None and _are_same(localiser, matches, fit, other)
-    if is_same:
+    if fit is None or other is None:
+        is_same, goes_back = False, fit is None and other is not None
+    elif is_same := _are_same(localiser, matches, fit, other):
         goes_back = earlier.squared_departure(other.pose) < prediction.squared_departure(fit.pose)
     else:
-        goes_back = other is not None and (fit is None or other.count > fit.count)
+        goes_back = other.count > fit.count
     if goes_back:
         matches, fit, other = others, other, fit
     else:
