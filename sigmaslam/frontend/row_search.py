@@ -123,12 +123,12 @@ def _derivative(image: np.ndarray, scale: int) -> np.ndarray:
     return cv2.Sobel(image, cv2.CV_16S, 1, 0)
 
 
-def _alike(*derivatives: np.ndarray) -> list[np.ndarray]:
+def _alike(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (H, W) of two eyes as uint8 about 128; those of an eye with far less light are raised."""
-    strength = np.array([max(float(cv2.meanStdDev(each)[1][0, 0]), 1.0) for each in derivatives])
-    gain = strength.max() / strength
-    gain = np.where(gain > _EQUAL_LIGHT, gain, 1.0)
-    return [
-        cv2.convertScaleAbs(each, alpha=0.5 * factor, beta=128.0)
-        for each, factor in zip(derivatives, gain.tolist(), strict=True)
-    ]
+    one, other = (max(float(cv2.meanStdDev(each)[1][0, 0]), 1.0) for each in (left, right))
+    gain = other / one
+    raised = (max(gain, 1.0), max(1.0 / gain, 1.0)) if max(gain, 1.0 / gain) > _EQUAL_LIGHT else (1.0, 1.0)
+    first, second = (
+        cv2.convertScaleAbs(each, alpha=0.5 * by, beta=128.0) for each, by in zip((left, right), raised, strict=True)
+    )
+    return first, second

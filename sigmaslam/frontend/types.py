@@ -76,12 +76,7 @@ class StereoView:
 
     def has_stereo(self, min_points: int, min_to_judge: int) -> bool:
         """Whether enough features have a disparity, and the eyes are not swapped as of `is_swapped`."""
-        return self.stereo_count >= min_points and not self.is_swapped(min_to_judge)
-
-    @property
-    def stereo_count(self) -> int:
-        """Of how many features the disparity is known."""
-        return int(np.isfinite(self.disparity).sum())
+        return int(np.isfinite(self.disparity).sum()) >= min_points and not self.is_swapped(min_to_judge)
 
     def is_swapped(self, min_to_judge: int) -> bool:
         """Whether the right image looks like the left eye's: too much lies behind infinity.

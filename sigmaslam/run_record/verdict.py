@@ -68,28 +68,23 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
         Doubt.TIME: "the image shows another moment than its stamp says: does the driver deliver frames out of order?",
         Doubt.MOTIONS: "two motions explain the image about as well: a torn image, or something large that moves",
     }
-    said = {
-        reason: f"From {found['first']:.1f} s on, in {found['frames']} frames: {words.get(reason, reason)}. The "
-        "covariances of these poses hold what that may make of them."
-        for reason, found in summary.get("doubts", {}).items()
+    # Of these the covariances say nothing, or not all.
+    alone = {
+        Doubt.RIG: "The rig changed at {first:.1f} s: the right camera was bumped or turned. Its calibration was learned "
+        "anew from there: calibrate again.",
+        Doubt.FIXED: "From {first:.1f} s on landmarks stay in the image while others move, and draw poses along: dots of "
+        "a projector (switch it off), a reflection, dirt, or the vehicle (--mask).",
+        Doubt.EYES: "From {first:.1f} s on, in {frames} frames, the left image is of the right eye: they have no pose. "
+        "Does the driver number the cameras anew?",
     }
-    if Doubt.RIG in said:
-        said[Doubt.RIG] = (
-            f"The rig changed at {summary['doubts'][Doubt.RIG]['first']:.1f} s: the right camera was bumped or turned. "
-            "Its calibration was learned anew from there: calibrate again."
-        )
-    if Doubt.FIXED in said:
-        said[Doubt.FIXED] = (
-            f"From {summary['doubts'][Doubt.FIXED]['first']:.1f} s on landmarks stay in the image while others move, "
-            "and draw poses along: dots of a projector (switch it off), a reflection, dirt, or the vehicle (--mask)."
-        )
-    if Doubt.EYES in said:
-        eyes = summary["doubts"][Doubt.EYES]
-        said[Doubt.EYES] = (
-            f"From {eyes['first']:.1f} s on, in {eyes['frames']} frames, the left image is of the right eye: they have "
-            "no pose. Does the driver number the cameras anew?"
-        )
-    return list(said.values())
+    usual = (
+        "From {first:.1f} s on, in {frames} frames: {words}. The covariances of these poses hold what that may make of "
+    )
+    usual += "them."
+    return [
+        alone.get(reason, usual).format(**found, words=words.get(reason, reason))
+        for reason, found in summary.get("doubts", {}).items()
+    ]
 
 
 def times_verdict(summary: dict[str, Any]) -> str | None:

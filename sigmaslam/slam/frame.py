@@ -21,43 +21,41 @@ _MARGIN = 5
 class Frame:
     """A rectified pair. Its features, which only keyframes need, are made when they are asked for, or foreseen.
 
+    Attributes:
+        exchange: gives left and right as they are if each image is the other eye's.
+
     Args:
         left, right: (H, W) uint8, rectified.
         frontend: detects features.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
-        exchange: gives left and right as they are if each image is the other eye's.
     """
 
     def __init__(
-        self,
-        left: np.ndarray,
-        right: np.ndarray,
-        frontend: Frontend,
-        usable: np.ndarray | None = None,
-        exchange: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None,
+        self, left: np.ndarray, right: np.ndarray, frontend: Frontend, usable: np.ndarray | None = None
     ) -> None:
+        self.exchange: Callable[[], tuple[np.ndarray, np.ndarray]] = lambda: (right, left)
+        self._observe = frontend.observe
         self.left = left
         self.right = right
         self.usable = usable
         self._view = Deferred(lambda: frontend.observe(left, right).within(usable))
-        self._exchanged = lambda: frontend.observe(*(exchange() if exchange else (right, left)))
 
     @property
     def view(self) -> StereoView:
         """The pair with its features and their disparities."""
         return self._view.get()
 
-    def is_exchanged(self, usual: int, min_to_judge: int) -> bool:
+    def is_exchanged(self, last: StereoView, min_to_judge: int) -> bool:
         """Whether each image is the other eye's: hardly a disparity as they are, and many the other way round.
 
         Args:
-            usual: features of the last keyframe with a disparity.
+            last: the last keyframe's view, of which usual shares are.
             min_to_judge: as of `StereoView.is_swapped`, by which some cameras show it at once.
         """
-        enough = ACCEPTANCE.exchanged_share * usual
-        if self.view.is_swapped(min_to_judge) or self.view.stereo_count >= enough:
+        few = int(ACCEPTANCE.exchanged_share * np.isfinite(last.disparity).sum())
+        if self.view.is_swapped(min_to_judge) or self.view.has_stereo(few, min_to_judge):
             return self.view.is_swapped(min_to_judge)
-        return self._exchanged().stereo_count > max(2 * self.view.stereo_count, enough)
+        return self._observe(*self.exchange()).has_stereo(2 * few, min_to_judge)
 
     def foresee(self, executor: Executor) -> None:
         """Begins to make the view beside the tracking of the frame."""

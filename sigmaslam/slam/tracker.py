@@ -53,7 +53,7 @@ from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
 from sigmaslam.slam.rig_change import RigChange, RigWatch
 from sigmaslam.slam.scrutiny import Scrutiny
-from sigmaslam.slam.set_clock import follow_either, localise_either
+from sigmaslam.slam.set_clock import by_times
 from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
@@ -191,8 +191,8 @@ class StereoTracker:
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
-        exchange = partial(self.rectifier.rectify, right, left)
-        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable, exchange)
+        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
+        frame.exchange = partial(self.rectifier.rectify, right, left)
         clock.lap("rectify")
         if self._course.timestamp is not None:
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
@@ -203,7 +203,7 @@ class StereoTracker:
         is_repeated = self._last_pairs.is_repeated(left, right)
         matches, fit, change, doubts = GuidedMatches.empty(), None, None, Doubts()
         if not is_repeated and not is_noise(left):
-            matches, fit, change = self._localise(frame, timestamp, clock, doubts)
+            matches, fit, change = by_times(self._localiser, partial(self._localise, frame, timestamp, clock, doubts))
         if fit is None and dead_reckoning(self._motion) is not None:
             # Images that give no pose say nothing against the prediction either.
             self._motion.widen(1.0 / self._motion.widened)
@@ -273,17 +273,18 @@ class StereoTracker:
         if guided and self._follower.is_ready:
             if self._beside is not None and self._mapper.keyframe_is_near:
                 frame.foresee(self._beside)
-            matches, fit = follow_either(self._localiser, frame, self._keyframes.active, prediction, clock)
+            matches, fit = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
             change = None if fit is not None else self._rig_watch.find_change(frame, matches, prediction)
             if fit is not None or change is not None:
                 return matches, fit, change
+            prediction = Prediction.of(self._window, self._motion)
         view = frame.view
         clock.lap("features")
         keyframes = [keyframe.view for keyframe in self._keyframes.active]
-        if frame.is_exchanged(keyframes[-1].stereo_count if keyframes else 0, self.config.min_inliers):
+        if frame.is_exchanged(keyframes[-1], self.config.min_inliers):
             doubts.add(Doubt.EYES)
             return GuidedMatches.empty(), None, None
-        return *localise_either(self._localiser, view, keyframes, guided, clock), None
+        return *self._localiser.localise(view, keyframes, prediction, guided, clock), None
 
     def _correct(self, fit: FrameFit, blur: float, matches: GuidedMatches, timestamp: float) -> FrameFit:
         """Takes a pose over, less certain where the frame is blurred."""
