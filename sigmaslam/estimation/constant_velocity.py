@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.sample_buffer import SampleBuffer
-from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_inverse, se3_log
 from sigmaslam.inference.backends import load_step
 
 # Order of the graph's error state, see sigmaslam_models.estimator.pose_prediction.
@@ -75,12 +75,8 @@ class MotionFilter:
         """(6, 6) of `step` by the motion alone, before it was widened."""
         return self.step_covariance / self.widened
 
-    def forget_twist(self, sigma: np.ndarray) -> None:
-        """No velocity is known but that it is about zero; sigma (6,) m/s and rad/s."""
-        self.set_twist(np.zeros(6), sigma)
-
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
-        """Replaces the velocity by one that is independent of the pose."""
+        """Replaces the velocity by one that is independent of the pose; both (6,), m/s and rad/s."""
         self.twist = twist
         self._covariance[_TWIST, :] = 0.0
         self._covariance[:, _TWIST] = 0.0
@@ -124,11 +120,6 @@ class MotionFilter:
         self.widen(1.0 / self.widened)
         self._covariance[_POSE, _POSE] += np.outer(error, error)
         return error
-
-    def go_back(self, seconds: float) -> None:
-        """Predicts an earlier moment, no more certain than the later one, and no longer widened."""
-        self.widen(1.0 / self.widened)
-        self.step = se3_exp(-self.way(seconds)) @ self.step
 
     def restore(self, state: MotionState, widened: float) -> None:
         """Takes an earlier state of constant velocity back, to the bit."""

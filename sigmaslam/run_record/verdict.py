@@ -70,17 +70,17 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
     }
     # Of these the covariances say nothing, or not all.
     alone = {
-        Doubt.RIG: "The rig changed at {first:.1f} s: the right camera was bumped or turned. Its calibration was learned "
-        "anew from there: calibrate again.",
-        Doubt.FIXED: "From {first:.1f} s on landmarks stay in the image while others move, and draw poses along: dots of "
-        "a projector (switch it off), a reflection, dirt, or the vehicle (--mask).",
+        Doubt.RIG: "The rig changed at {first:.1f} s: the right camera was bumped or turned. Its calibration was "
+        "learned anew from there: calibrate again.",
+        Doubt.FIXED: "From {first:.1f} s on landmarks stay in the image while others move, and draw poses along: dots "
+        "of a projector (switch it off), a reflection, dirt, or the vehicle (--mask).",
         Doubt.EYES: "From {first:.1f} s on, in {frames} frames, the left image is of the right eye: they have no pose. "
         "Does the driver number the cameras anew?",
     }
     usual = (
-        "From {first:.1f} s on, in {frames} frames: {words}. The covariances of these poses hold what that may make of "
+        "From {first:.1f} s on, in {frames} frames: {words}. The covariances of these poses hold what that may make "
     )
-    usual += "them."
+    usual += "of them."
     return [
         alone.get(reason, usual).format(**found, words=words.get(reason, reason))
         for reason, found in summary.get("doubts", {}).items()

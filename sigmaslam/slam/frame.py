@@ -66,15 +66,17 @@ class Frame:
         self._view.cancel()
 
 
-def usable_pixels(mask: np.ndarray, rectifier: StereoRectifier) -> np.ndarray:
-    """(H, W) bool, pixels of the rectified left image whose patches show nothing that is masked.
+def usable_pixels(mask: np.ndarray | None, rectifier: StereoRectifier) -> np.ndarray | None:
+    """(H, W) bool, pixels of the rectified left image whose patches show nothing that is masked; None: all of them.
 
     Args:
-        mask: (H, W) bool or uint8 of the raw left image, zero where it is not to be used.
+        mask: (H, W) bool or uint8 of the raw left image, zero where it is not to be used; None: nothing is masked.
         rectifier: of the camera.
     Raises:
         FrameError: the mask has the wrong type or size, or is zero everywhere.
     """
+    if mask is None:
+        return None
     check_mask(mask, rectifier.camera.left.width, rectifier.camera.left.height)
     side = 2 * _MARGIN + 1
     return cv2.erode(rectifier.rectify_mask((mask > 0).astype(np.uint8)), np.ones((side, side), np.uint8)) > 0

@@ -142,5 +142,5 @@ class Recovery:
     def _insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe that sees no known landmark; its velocity is unknown."""
         tracks = self.mapper.insert(new)
-        self.motion.forget_twist(initial_twist_sigma(self.config, self.window.depth))
+        self.motion.set_twist(np.zeros(6), initial_twist_sigma(self.config, self.window.depth))
         return tracks

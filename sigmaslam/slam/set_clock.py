@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sigmaslam.estimation.constant_velocity import dead_reckoning
+from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
@@ -29,9 +30,9 @@ def by_times(localiser: Localiser, localise: Callable[[], Found]) -> Found:
     if late == 0.0 or change is not None or dead_reckoning(motion) is not None or not len(localiser.window):
         return matches, fit, change
     as_stamped = motion.state, motion.widened
-    motion.go_back(0.0)
+    go_back(motion, 0.0)
     prediction = Prediction.of(localiser.window, motion)
-    motion.go_back(late)
+    go_back(motion, late)
     earlier = Prediction.of(localiser.window, motion)
     others, other, _ = localise()
     if fit is None or other is None:
@@ -49,6 +50,12 @@ def by_times(localiser: Localiser, localise: Callable[[], Found]) -> Found:
     elif other is not None and not is_same and is_rival(other.count, fit.count):
         matches = replace(matches, rival=other.pose)
     return matches, fit, None
+
+
+def go_back(motion: MotionFilter, seconds: float) -> None:
+    """Predicts an earlier moment, no more certain than the later one, and no longer widened."""
+    motion.widen(1.0 / motion.widened)
+    motion.step = se3_exp(-motion.way(seconds)) @ motion.step
 
 
 def _are_same(localiser: Localiser, matches: GuidedMatches, fit: FrameFit, other: FrameFit) -> bool:

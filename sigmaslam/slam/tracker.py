@@ -133,8 +133,7 @@ class StereoTracker:
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
-        localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
-        self._localiser = localiser
+        self._localiser = localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
         self._scrutiny = Scrutiny(localiser, self._clock, admission.moving, disparity_error is not None)
         self._rig_watch = RigWatch(window, self._localiser)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
@@ -185,9 +184,8 @@ class StereoTracker:
         # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
         with self._turn, self._blas.limit(limits=1, user_api="blas"):
             seconds = check_frame(left, right, timestamp, self._course.timestamp)
-            usable = None if mask is None else usable_pixels(mask, self.rectifier)
-            # Drivers fill their buffers again.
-            return self._step(np.array(left), np.array(right), seconds, usable)
+            # Copies, as drivers fill their buffers again.
+            return self._step(np.array(left), np.array(right), seconds, usable_pixels(mask, self.rectifier))
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
@@ -198,7 +196,7 @@ class StereoTracker:
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
             if sigma > 0.0 and self._clock.was_believed:
                 # It was learned by wrong times.
-                self._motion.forget_twist(initial_twist_sigma(self.config, self._window.depth))
+                self._motion.set_twist(np.zeros(6), initial_twist_sigma(self.config, self._window.depth))
             self._motion.predict(seconds, densities(self.config, self._window.depth), sigma, timestamp)
         is_repeated = self._last_pairs.is_repeated(left, right)
         matches, fit, change, doubts = GuidedMatches.empty(), None, None, Doubts()

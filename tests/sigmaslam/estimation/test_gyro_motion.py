@@ -17,7 +17,7 @@ BIAS = np.array([-0.003, 0.02, 0.08])
 def fly(moves: MotionFilter, frames: int, dark: int, seed: int, sign: float = 1.0) -> tuple[np.ndarray, float]:
     """Error (6,) of the pose since the start after dark frames, and the NEES of its turn per degree of freedom."""
     rng, motion = np.random.default_rng(seed), Motion(seed)
-    moves.forget_twist(np.ones(6))
+    moves.set_twist(np.zeros(6), np.ones(6))
     samples = motion.measure(np.arange(-0.02, 6.0, 0.005))
     noise = SENSOR.gyro_density / np.sqrt(0.005) * rng.normal(size=samples.gyro.shape)
     rates = sign * samples.gyro + BIAS + noise
@@ -59,7 +59,7 @@ def test_the_velocity_alone_is_forgotten():
     moves = GyroMotion("onnx", SENSOR, MOUNTING)
     fly(moves, 20, 0, 1)
     rate, spread = moves.twist[3:].copy(), moves.state.covariance[9:, 9:]
-    moves.forget_twist(np.full(6, 7.0))
+    moves.set_twist(np.zeros(6), np.full(6, 7.0))
     np.testing.assert_array_equal(moves.twist, np.r_[np.zeros(3), rate])
     np.testing.assert_array_equal(moves.state.covariance[9:, 9:], spread)
     np.testing.assert_array_equal(moves.state.covariance[6:9, 6:9], 49.0 * np.eye(3))

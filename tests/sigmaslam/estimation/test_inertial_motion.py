@@ -51,7 +51,7 @@ class Flight:
             exact.accel + ACCEL_BIAS + scale * SENSOR.accel_density * self.rng.normal(size=size),
         )
         self.given, self.frame, self.key = 0, 0, self.camera(0)
-        self.filter.forget_twist(np.repeat([1.0, 1.0], 3))
+        self.filter.set_twist(np.zeros(6), np.repeat([1.0, 1.0], 3))
 
     def camera(self, frame: int) -> np.ndarray:
         return np.asarray(self.motion.poses(np.array([frame * FRAME]))[0] @ se3_inverse(MOUNTING))
@@ -185,7 +185,7 @@ def test_without_samples_it_is_constant_velocity():
     from sigmaslam.estimation.constant_velocity import MotionFilter
 
     flight, other = Flight(2), MotionFilter()
-    other.forget_twist(np.repeat([1.0, 1.0], 3))
+    other.set_twist(np.zeros(6), np.repeat([1.0, 1.0], 3))
     for _ in range(30):
         flight.fly(1, keyframes=1000, samples=False)
         other.predict(FRAME, DENSITIES)

@@ -40,25 +40,9 @@ def test_a_known_circle_is_driven_to_its_end():
     assert (motion.step_covariance == 0).all()
 
 
-def test_going_back_is_the_prediction_of_an_earlier_moment():
-    """But for what the spread of the velocity bends it by."""
-    motion, earlier = moving(), moving()
-    motion.predict(0.5, DENSITIES)
-    earlier.predict(0.2, DENSITIES)
-    covariance = motion.step_covariance.copy()
-    motion.widen(4.0)
-    state, step = motion.state, motion.step.copy()
-    motion.go_back(0.3)
-    np.testing.assert_allclose(motion.step, earlier.step, atol=5e-3)
-    np.testing.assert_allclose(motion.step_covariance, covariance)
-    motion.restore(state, 4.0)
-    np.testing.assert_array_equal(motion.step, step)
-    np.testing.assert_array_equal(motion.predicted_covariance, covariance)
-
-
 def test_uncertainty_at_rest_grows_by_the_integral_of_white_acceleration():
     motion = MotionFilter()
-    motion.forget_twist(np.repeat([1e-4, 2e-4], 3))
+    motion.set_twist(np.zeros(6), np.repeat([1e-4, 2e-4], 3))
     motion.predict(2.0, np.array([3e-9, 6e-9]))
     expected = np.repeat([4e-8 + 3e-9 * 8 / 3, 16e-8 + 6e-9 * 8 / 3], 3)
     np.testing.assert_allclose(motion.step_covariance, np.diag(expected), rtol=1e-4, atol=1e-14)
@@ -113,7 +97,7 @@ def test_a_pose_that_says_nothing_new_changes_nothing():
 def test_a_perfect_pose_after_a_perfect_start_tells_the_mean_velocity():
     """Without noise the twist is known from two poses."""
     motion = MotionFilter()
-    motion.forget_twist(np.full(6, 0.01))
+    motion.set_twist(np.zeros(6), np.full(6, 0.01))
     motion.predict(0.5, np.zeros(2))
     twist = np.array([0.01, -0.02, 0.01, 0.005, 0.01, -0.01])
     motion.correct(se3_exp(0.5 * twist), np.zeros((6, 6)))
@@ -142,7 +126,7 @@ def test_a_keyframe_keeps_the_velocity_and_starts_from_where_it_is():
 def test_a_forgotten_twist_is_independent_of_the_pose():
     motion = moving()
     pose = motion.step_covariance.copy()
-    motion.forget_twist(np.full(6, 0.5))
+    motion.set_twist(np.zeros(6), np.full(6, 0.5))
     assert (motion.twist == 0).all()
     assert (joint_covariance(motion)[:6, 6:] == 0).all()
     np.testing.assert_array_equal(motion.step_covariance, pose)
@@ -158,7 +142,7 @@ def test_velocity_is_found_from_noisy_poses_and_its_error_is_as_large_as_it_says
     for _ in range(40):
         motion.start_keyframe()
         sigma = np.repeat([0.3, 0.1], 3)
-        motion.forget_twist(sigma)
+        motion.set_twist(np.zeros(6), sigma)
         twist, truth = sigma * rng.standard_normal(6), np.eye(4)
         density = np.repeat([1e-4, 1e-4], 3)
         for _ in range(10):

@@ -16,7 +16,7 @@ def filtered_chain(measured: list[bool], seed: int = 0) -> tuple[list[MotionLink
     """A chain from a keyframe on, and the measured poses (6,) as tangent vectors; a frame without a measurement too."""
     random = np.random.default_rng(seed)
     motion = MotionFilter()
-    motion.forget_twist(np.full(6, TWIST_SIGMA))
+    motion.set_twist(np.zeros(6), np.full(6, TWIST_SIGMA))
     chain = [MotionLink(0.0, motion.state, motion.state)]
     places = []
     for k, is_measured in enumerate(measured, start=1):

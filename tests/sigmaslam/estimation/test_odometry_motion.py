@@ -33,7 +33,7 @@ class Drive:
         twists = wheels(self.motion, self.t) * np.r_[np.full(3, scale), np.ones(3)]
         self.twists = twists + noise * self.rng.normal(size=twists.shape)
         self.given, self.frame, self.key = 0, 0, self.camera(0)
-        self.filter.forget_twist(np.ones(6))
+        self.filter.set_twist(np.zeros(6), np.ones(6))
 
     def camera(self, frame: int) -> np.ndarray:
         return np.asarray(self.motion.poses(np.array([frame * FRAME]))[0] @ se3_inverse(MOUNTING))
@@ -154,5 +154,5 @@ def test_a_loss_leaves_the_velocity_known():
     drive = Drive(6)
     drive.drive(30)
     twist = drive.filter.twist.copy()
-    drive.filter.forget_twist(np.ones(6))
+    drive.filter.set_twist(np.zeros(6), np.ones(6))
     np.testing.assert_array_equal(drive.filter.twist, twist)

@@ -9,17 +9,20 @@ from functools import partial
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Localiser
-from sigmaslam.slam.set_clock import Found, by_times
+from sigmaslam.slam.set_clock import Found, by_times, go_back
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.estimates import Demo, track
 
 pytestmark = pytest.mark.long
+
+DENSITIES = np.array([0.3, 0.2])
 
 
 Tracked = tuple[StereoTracker, Callable[[], Found], np.ndarray]
@@ -81,3 +84,28 @@ def test_a_rival_is_said_and_the_covariance_spans_both(demo: Demo, monkeypatch: 
     estimate = tracker.step(frames[12].left, frames[12].right, frames[12].timestamp)
     assert (estimate.status, list(estimate.doubts)) == ("ambiguous", [Doubt.MOTIONS])
     assert np.linalg.eigvalsh(estimate.covariance)[-1] > 0.9
+
+
+def test_going_back_is_the_prediction_of_an_earlier_moment():
+    """But for what the spread of the velocity bends it by."""
+    motion, earlier = moving(), moving()
+    motion.predict(0.5, DENSITIES)
+    earlier.predict(0.2, DENSITIES)
+    covariance = motion.step_covariance.copy()
+    motion.widen(4.0)
+    state, step = motion.state, motion.step.copy()
+    go_back(motion, 0.3)
+    np.testing.assert_allclose(motion.step, earlier.step, atol=5e-3)
+    np.testing.assert_allclose(motion.step_covariance, covariance)
+    motion.restore(state, 4.0)
+    np.testing.assert_array_equal(motion.step, step)
+    np.testing.assert_array_equal(motion.predicted_covariance, covariance)
+
+
+def moving() -> MotionFilter:
+    """A filter that has seen some frames: pose and twist are correlated."""
+    motion = MotionFilter()
+    motion.set_twist(np.array([0.2, -0.1, 1.0, 0.05, 0.1, -0.02]), np.repeat([0.3, 0.1], 3))
+    for _ in range(3):
+        motion.predict(0.1, DENSITIES)
+    return motion
