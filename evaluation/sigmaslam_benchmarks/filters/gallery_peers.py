@@ -23,6 +23,7 @@ from sigmaslam_filters import (
     LinearMotion,
     UnscentedKalmanFilter,
 )
+from sigmaslam_filters.core.noise_covariance import as_noise
 from sigmaslam_filters.systems import constant_velocity, constant_velocity_over
 
 TARGETS, STEPS, DT = 100, 60, 0.5
@@ -45,17 +46,22 @@ def targets(seed: int) -> Data:
     state, truth = 10.0 * rng.normal(size=(TARGETS, 4)), []
     start = state
     for step in range(STEPS):
-        motion = wild if 20 <= step < 40 else calm
-        noise = rng.normal(size=state.shape) @ np.linalg.cholesky(motion.noise.numpy()).T
-        state = state @ motion.matrix.numpy().T + noise
+        matrix, noise = (each.numpy() for each in (wild if 20 <= step < 40 else calm))
+        state = state @ matrix.T + rng.normal(size=state.shape) @ np.linalg.cholesky(noise).T
         truth.append(state)
     found = np.array(truth)
     return {"start": start, "truth": found[..., :2], "values": found[..., :2] + rng.normal(size=(STEPS, TARGETS, 2))}
 
 
-def _motions() -> tuple[LinearMotion, LinearMotion]:
-    calm = constant_velocity_over(torch.tensor([1e-3, 1e-3], dtype=torch.float64), DT)
-    return calm, LinearMotion(calm.matrix, 1e3 * calm.noise)
+def _moved(density: list[float], seconds: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Matrix and covariance of a constant velocity over a step."""
+    motion = constant_velocity_over(torch.tensor(density, dtype=torch.float64), seconds)
+    return motion.matrix, as_noise(motion.noise).covariance()
+
+
+def _motions() -> tuple[tuple[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
+    """Calm and wild."""
+    return _moved([1e-3, 1e-3], DT), _moved([1.0, 1.0], DT)
 
 
 def _height() -> LinearMeasurement:
@@ -68,8 +74,8 @@ def _start(states: int = 2) -> Gaussian:
 
 def _peer(dt: float) -> PeerFilter:
     """filterpy's filter of a height and its rate."""
-    peer, motion = PeerFilter(2, 1), constant_velocity_over(torch.tensor([0.5], dtype=torch.float64), dt)
-    peer.F, peer.Q, peer.H, peer.R = motion.matrix.numpy(), motion.noise.numpy(), np.eye(1, 2), 0.01 * np.eye(1)
+    peer, (matrix, noise) = PeerFilter(2, 1), _moved([0.5], dt)
+    peer.F, peer.Q, peer.H, peer.R = matrix.numpy(), noise.numpy(), np.eye(1, 2), 0.01 * np.eye(1)
     return peer
 
 
@@ -85,18 +91,17 @@ def irregular_ours(data: Data) -> np.ndarray:
 
 def irregular_filterpy(data: Data) -> np.ndarray:
     """Matrices are set at each step and kept for the smoother."""
-    peer, means, covariances, Fs, Qs = _peer(0.1), [], [], [], []
+    peer = _peer(0.1)
+    kept: list[tuple[np.ndarray, ...]] = []
     for value, step in zip(data["values"], np.diff(data["times"], prepend=data["times"][0]), strict=True):
-        if means:
+        if kept:
             at = _peer(step)
             peer.F, peer.Q = at.F, at.Q
             peer.predict()
         peer.update(value)
-        means.append(peer.x.copy())
-        covariances.append(peer.P.copy())
-        Fs.append(peer.F)
-        Qs.append(peer.Q)
-    return np.asarray(peer.rts_smoother(np.array(means), np.array(covariances), Fs, Qs)[0][:, 0, 0])
+        kept.append((peer.x.copy(), peer.P.copy(), peer.F, peer.Q))
+    means, covariances, matrices, noises = (np.array(each) for each in zip(*kept, strict=True))
+    return np.asarray(peer.rts_smoother(means, covariances, matrices, noises)[0][:, 0, 0])
 
 
 # A fixed lag of ten steps
@@ -147,7 +152,7 @@ def gated_filterpy(data: Data) -> np.ndarray:
 def targets_ours(data: Data) -> np.ndarray:
     """All as one batch."""
     turn = torch.tensor([[0.97, 0.03], [0.03, 0.97]], dtype=torch.float64)
-    imm = InteractingMultipleModels(KalmanFilter(), list(_motions()), turn)
+    imm = InteractingMultipleModels(KalmanFilter(), [LinearMotion(*each) for each in _motions()], turn)
     see = LinearMeasurement(torch.eye(2, 4, dtype=torch.float64), torch.eye(2, dtype=torch.float64))
     eye = torch.eye(4, dtype=torch.float64).expand(TARGETS, 4, 4)
     mixture, means = imm.start(Gaussian(torch.from_numpy(data["start"]), eye)), []
@@ -162,9 +167,9 @@ def targets_filterpy(data: Data) -> np.ndarray:
     turn, means = np.array([[0.97, 0.03], [0.03, 0.97]]), np.zeros((STEPS, TARGETS, 2))
     for target in range(TARGETS):
         peers = []
-        for motion in _motions():
+        for matrix, noise in _motions():
             peer = PeerFilter(4, 2)
-            peer.F, peer.Q, peer.H, peer.R = motion.matrix.numpy(), motion.noise.numpy(), np.eye(2, 4), np.eye(2)
+            peer.F, peer.Q, peer.H, peer.R = matrix.numpy(), noise.numpy(), np.eye(2, 4), np.eye(2)
             peer.x = data["start"][target][:, None].copy()
             peers.append(peer)
         imm = IMMEstimator(peers, np.array([0.5, 0.5]), turn)
