@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.sample_buffer import SampleBuffer
-from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_inverse, se3_log
 from sigmaslam.inference.backends import load_step
 
 # Order of the graph's error state, see sigmaslam_models.estimator.pose_prediction.
@@ -124,15 +124,6 @@ class MotionFilter:
         self.widen(1.0 / self.widened)
         self._covariance[_POSE, _POSE] += np.outer(error, error)
         return error
-
-    def go_back(self, seconds: float) -> None:
-        """Predicts an earlier moment, no more certain than the later one, and no longer widened."""
-        self.widen(1.0 / self.widened)
-        self.step = se3_exp(-self.way(seconds)) @ self.step
-
-    def restore(self, state: MotionState, widened: float) -> None:
-        """Takes an earlier state of constant velocity back, to the bit."""
-        self.step, self.twist, self._covariance, self.widened = state.step, state.twist, state.covariance, widened
 
     def way(self, seconds: float) -> np.ndarray:
         """(6,) what the velocity makes of the pose in that time, perturbed from the left in the keyframe."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from sigmaslam.estimation.constant_velocity import dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
@@ -28,10 +29,10 @@ def by_times(localiser: Localiser, localise: Callable[[], Found]) -> Found:
     matches, fit, change = localise()
     if late == 0.0 or change is not None or dead_reckoning(motion) is not None or not len(localiser.window):
         return matches, fit, change
-    as_stamped = motion.state, motion.widened
-    motion.go_back(0.0)
+    as_stamped = vars(motion).copy()
+    motion.widen(1.0 / motion.widened)
     prediction = Prediction.of(localiser.window, motion)
-    motion.go_back(late)
+    motion.step = se3_exp(-motion.way(late)) @ motion.step
     earlier = Prediction.of(localiser.window, motion)
     others, other, _ = localise()
     if fit is None or other is None:
@@ -43,7 +44,7 @@ def by_times(localiser: Localiser, localise: Callable[[], Found]) -> Found:
     if goes_back:
         matches, fit, other = others, other, fit
     else:
-        motion.restore(*as_stamped)
+        vars(motion).update(as_stamped)
     if fit is None:
         motion.doubt_time(late)
     elif other is not None and not is_same and is_rival(other.count, fit.count):

@@ -40,22 +40,6 @@ def test_a_known_circle_is_driven_to_its_end():
     assert (motion.step_covariance == 0).all()
 
 
-def test_going_back_is_the_prediction_of_an_earlier_moment():
-    """But for what the spread of the velocity bends it by."""
-    motion, earlier = moving(), moving()
-    motion.predict(0.5, DENSITIES)
-    earlier.predict(0.2, DENSITIES)
-    covariance = motion.step_covariance.copy()
-    motion.widen(4.0)
-    state, step = motion.state, motion.step.copy()
-    motion.go_back(0.3)
-    np.testing.assert_allclose(motion.step, earlier.step, atol=5e-3)
-    np.testing.assert_allclose(motion.step_covariance, covariance)
-    motion.restore(state, 4.0)
-    np.testing.assert_array_equal(motion.step, step)
-    np.testing.assert_array_equal(motion.predicted_covariance, covariance)
-
-
 def test_uncertainty_at_rest_grows_by_the_integral_of_white_acceleration():
     motion = MotionFilter()
     motion.forget_twist(np.repeat([1e-4, 2e-4], 3))
