@@ -103,8 +103,7 @@ class _Probed:
 def _rows_in_all(image: _Probed, others: list[_Probed]) -> np.ndarray:
     """(P,) bool, which of the rows are in all of the others, where some rows are not."""
     same = np.array([[one == row for one, row in zip(other.rows, image.rows, strict=False)] for other in others])
-    in_all = same.all(axis=0)
-    return np.asarray(in_all & ~in_all.all())
+    return np.asarray(same.all(axis=0) & ~same.all())
 
 
 def _shows(image: _Probed, other: _Probed, panel: np.ndarray) -> bool:

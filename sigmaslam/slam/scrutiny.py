@@ -116,26 +116,22 @@ class Scrutiny:
     def _is_fixed(self, left: np.ndarray, matches: GuidedMatches, fit: FrameFit) -> bool:
         """Whether landmarks that agree with the pose stay where they were in an earlier image, though they should move.
 
-        Or all stay, the camera stands by its pose, and most of the image has changed.
+        Or by the pose the camera stands, and most of the image has changed. Where most stay a loop has moved the world.
         """
         rows, seen = matches.views.landmark, matches.views.measurement[:, :2]
         ids = self._window.landmarks.id[rows]
-        if self._before is not None:
-            image, pose, old_ids, old_seen = self._before
+        image, pose, old_ids, old_seen = self._before or (left, fit.pose, ids, seen)
+        ways = seen_from(self._window, rows, pose)[:, :2] - seen_from(self._window, rows, fit.pose)[:, :2]
+        ways = np.linalg.norm(ways, axis=1)
+        moves = ways > 3.0 * ACCEPTANCE.stands
+        if self._before is None or 2 * moves.sum() > np.isfinite(ways).sum():
             _, now, then = np.intersect1d(ids, old_ids, return_indices=True)
-            ways = seen_from(self._window, rows, pose)[:, :2] - seen_from(self._window, rows, fit.pose)[:, :2]
-            ways = np.linalg.norm(ways, axis=1)
-            moved = float(np.nanmedian(ways)) if np.isfinite(ways).any() else 0.0
-            if moved < ACCEPTANCE.stands:
-                return shows_motion(image, left)
-            if moved < 3.0 * ACCEPTANCE.stands:
-                return self._fixed_for > 0
-            moves = ways[now] > 3.0 * ACCEPTANCE.stands
-            stays = moves & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
-            # Where all stay a loop has moved the world.
-            is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves.sum()
+            stays = moves[now] & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
+            is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves[now].sum()
             self._fixed_for = _SPOILT if is_fixed else max(self._fixed_for - 1, 0)
-        self._before = left.copy(), fit.pose, ids, seen
+            self._before = left.copy(), fit.pose, ids, seen
+        elif 2 * (ways > ACCEPTANCE.stands).sum() < len(ways) and shows_motion(image, left):
+            return True
         return self._fixed_for > 0
 
     def _is_other(self, second: SecondMotion, fit: FrameFit) -> bool:

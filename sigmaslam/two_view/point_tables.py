@@ -68,10 +68,9 @@ def _misses(camera: StereoCamera, points: np.ndarray, pixels: np.ndarray) -> np.
     """(N,) pixels between (N, 4), of which points (N, 3) are made, and where these are seen; infinite outside."""
     T = se3_inverse(camera.T_left_right)
     seen = camera.left.project(points), camera.right.project(points @ T[:3, :3].T + T[:3, 3])
-    ways = [np.linalg.norm(each - pixels[:, 2 * k : 2 * k + 2], axis=1) for k, each in enumerate(seen)]
+    ways = np.linalg.norm(np.stack(seen, axis=1) - pixels.reshape(-1, 2, 2), axis=2).max(axis=1)
     sizes = [size for eye in (camera.left, camera.right) for size in (eye.width, eye.height)]
-    inside = np.logical_and(pixels > -1.0, pixels < sizes).all(axis=1)
-    return np.where(inside, np.nan_to_num(np.maximum(*ways), nan=np.inf), np.inf)
+    return np.where(((pixels > -1.0) & (pixels < sizes)).all(axis=1) & np.isfinite(ways), ways, np.inf)
 
 
 def triangulate_pairs(

@@ -124,7 +124,8 @@ def _changed(change: Callable[..., tuple[np.ndarray, np.ndarray]], count: int = 
 
 def _fields(number: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Even and odd rows of two moments: every other row is moved as the next frame moves."""
-    return tuple(np.where(np.arange(len(eye))[:, None] % 2, np.roll(eye, 3, axis=1), eye) for eye in (left, right))
+    odd = np.arange(len(left))[:, None] % 2
+    return np.where(odd, np.roll(left, 3, axis=1), left), np.where(odd, np.roll(right, 3, axis=1), right)
 
 
 def _panel(number: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
