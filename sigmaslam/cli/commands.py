@@ -48,6 +48,8 @@ GROUPS = {
     "map": {
         "reconstruct": "Make a dense cloud, and a mesh, of a run.",
         "refine": "Adjust all of a run at once (extra 'graph').",
+        "show": "Print what maps hold.",
+        "merge": "Make one map of two runs in one place.",
     },
     "train": {
         "network": "Train the correspondence network.",
@@ -56,11 +58,13 @@ GROUPS = {
         "render": "Render a stereo sequence with exact truth.",
     },
 }
-# Commands whose function stands elsewhere than in `sigmaslam.cli.NAME:NAME`.
+# Commands whose function stands elsewhere than in `sigmaslam.cli.NAME:NAME`, with their group where names are alike.
 PLACES = {
     "demo": "track:demo",
     "board": "calibrate:calibrate",
-    "show": "calibration:show",
+    "calibrate show": "calibration:show",
+    "map show": "maps:show",
+    "merge": "maps:merge",
     "convert": "calibration:convert",
     "triangulate": "points:triangulate",
     "orient": "points:orient",
@@ -74,7 +78,7 @@ RENAMED = {
     "calibration": "calibrate",
     "rectify": "calibrate rectify",
     **{name: f"images {name}" for name in GROUPS["images"]},
-    **{name: f"map {name}" for name in GROUPS["map"]},
+    **{name: f"map {name}" for name in ("reconstruct", "refine")},
     "train-scorer": "train scorer",
     "export": "train export",
     "render": "train render",
@@ -83,7 +87,9 @@ RENAMED = {
 
 
 class _Commands(UserDict[str, Any]):
-    """Commands by name; the module of one of `GROUPS` is imported when the command is asked for."""
+    """Commands of a group by name; the module of one of `GROUPS` is imported when the command is asked for."""
+
+    group = ""
 
     def __getitem__(self, name: str) -> Any:
         found = self.data[name]
@@ -91,7 +97,8 @@ class _Commands(UserDict[str, Any]):
             return found
         if name in GROUPS:
             return CommandGroup(name=name, help=found, no_args_is_help=True, rich_markup_mode=None)
-        module, function = PLACES.get(name, f"{name}:{name}").split(":")
+        place = PLACES.get(f"{self.group} {name}") or PLACES.get(name, f"{name}:{name}")
+        module, function = place.split(":")
         # Plain help: rich's tables cut long words and give flags a type.
         alone = typer.Typer(add_completion=False, rich_markup_mode=None)
         function = getattr(import_module(f"sigmaslam.cli.{module}"), function)
@@ -105,6 +112,7 @@ class CommandGroup(TyperGroup):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.commands: Any = _Commands(GROUPS[str(self.name)] | dict(self.commands))
+        self.commands.group = str(self.name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command of the first words; those of the release before are understood, with a word on stderr."""

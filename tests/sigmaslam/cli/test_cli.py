@@ -321,6 +321,8 @@ def test_training_without_its_extra_says_how_to_install_it(tmp_path: Path):
         "images denoise",
         "map",
         "map refine",
+        "map show",
+        "map merge",
         "localize",
         "train",
         "train network",

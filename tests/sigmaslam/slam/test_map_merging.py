@@ -12,7 +12,8 @@ from sigmaslam.geometry.se3 import se3_inverse, se3_log, turn_covariance
 from sigmaslam.readers.trajectory_files import read_kitti
 from sigmaslam.runs.request import InputOptions, OutputOptions, TrackRequest
 from sigmaslam.runs.track import track_sequence
-from tests.support.examples import load_example
+from sigmaslam.slam.map_merging import MapFile, merge
+from tests.support.commands import run_here
 
 
 @pytest.mark.slow
@@ -22,10 +23,12 @@ def test_two_maps_become_one(demo_sequence: Path, tmp_path: Path, without_report
         ("other", InputOptions(demo_sequence, start=12)),
     ):
         track_sequence(TrackRequest(some, OutputOptions(tmp_path / name)))
-    example = load_example("merge_maps")
-    one, other = (example.MapFile(tmp_path / name / "map.npz") for name in ("one", "other"))
-    save_arrays(tmp_path / "merged.npz", **example.merge(one, other))
-    merged = example.MapFile(tmp_path / "merged.npz")
+    one, other = (MapFile(tmp_path / name) for name in ("one", "other"))
+    said = run_here("map", "merge", str(tmp_path / "one"), str(other.path), "--out", str(tmp_path / "merged.npz"))
+    assert said.returncode == 0, said.stderr
+    assert said.stdout == run_here("map", "show", str(tmp_path / "merged.npz")).stdout
+    assert f"keyframes  {len(one.known) + len(other.known)}, " in said.stdout
+    merged = MapFile(tmp_path / "merged.npz")
     assert len(merged.known) == len(one.known) + len(other.known)
     assert len(merged.points.points) == len(one.points.points) + len(other.points.points)
     truth = read_kitti(demo_sequence / "poses.txt")
@@ -40,7 +43,7 @@ def test_two_maps_become_one(demo_sequence: Path, tmp_path: Path, without_report
         assert np.linalg.norm(error[:3]) < 0.01
         assert error @ np.linalg.solve(covariance, error) < 22.5  # 99.9 %
     # The other way round.
-    assert len(example.merge(other, one)["keyframe_poses"]) == len(merged.known)
+    assert len(merge(other, one)["keyframe_poses"]) == len(merged.known)
 
 
 @pytest.mark.slow
@@ -52,7 +55,6 @@ def test_maps_of_two_places_stay_two(demo_sequence: Path, tmp_path: Path, withou
     rng = np.random.default_rng(0)
     arrays["keyframe_descriptors"] = rng.permuted(arrays["keyframe_descriptors"], axis=1)
     save_arrays(tmp_path / "elsewhere.npz", **arrays)
-    example = load_example("merge_maps")
-    one, elsewhere = (example.MapFile(tmp_path / name) for name in ("one/map.npz", "elsewhere.npz"))
+    one, elsewhere = (MapFile(tmp_path / name) for name in ("one/map.npz", "elsewhere.npz"))
     with pytest.raises(InputError, match=r"elsewhere\.npz: 0 of .* keyframes are found"):
-        example.merge(one, elsewhere)
+        merge(one, elsewhere)

@@ -1,12 +1,8 @@
-"""Two maps of one place become one: keyframes of the second are found in the first, and all hang there.
+"""Two maps of one place become one: keyframes of the second are found in the first, and all hang there."""
 
-python examples/merge_maps.py one/map.npz other/map.npz merged.npz
-
-`sigmaslam track ... --map merged.npz` finds its place in both. With one file it tells what the map holds.
-"""
+from __future__ import annotations
 
 import itertools
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,11 +15,11 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import step_between
-from sigmaslam.files import save_arrays
 from sigmaslam.frontend import build_frontend
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log, turn_covariance
+from sigmaslam.progress import open_progress
 from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe, from_origin
@@ -34,11 +30,21 @@ from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.point_map import PointMap, hand_over_points, merge_maps
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
+# Keyframes of the first map that look most like one of the second.
+_CANDIDATES = 3
+
 
 class MapFile:
-    """What `sigmaslam track` left of a place: keyframes, their joint poses, points."""
+    """What `sigmaslam track` left of a place: keyframes, their joint poses, points.
+
+    Args:
+        path: map.npz, or the run folder with it.
+    Raises:
+        InputError: there is no map with keyframes.
+    """
 
     def __init__(self, path: Path) -> None:
+        path = path / "map.npz" if path.is_dir() else path
         arrays = load_arrays(path, "give map.npz of a run of `sigmaslam track`")
         if "intrinsics" not in arrays:
             raise InputError(f"{path}: a map without keyframes to find")
@@ -73,6 +79,8 @@ class MapFile:
 
 def merge(one: MapFile, other: MapFile) -> dict[str, np.ndarray]:
     """Arrays of a map that holds both, in the world of the first.
+
+    The second one hangs as a whole at the keyframe of the first that says best where it is.
 
     Raises:
         InputError: fewer than two keyframes of the other are found, or they contradict each other.
@@ -127,16 +135,19 @@ def _find(one: MapFile, other: MapFile) -> Found:
     for each in one.known:
         appearance.add(each.id, each.descriptors)
     links = []
-    for each in other.known:
-        view = each.view
-        for candidate in retrieve(view, 3, one.known, appearance):
-            relative = matcher.relative_pose_to(candidate.view, view)
-            if relative is not None and matcher.is_beyond_chance(relative):
-                shared = replace(relative, covariance=max(relative.clustering, 1.0) * relative.covariance)
-                at = from_origin(candidate, shared)
-                spread = turn_covariance(at.T_key_camera, at.covariance)
-                links.append((each, Link(candidate.origin, at.T_key_camera, spread, int(at.inliers.sum()))))
-                break
+    with open_progress() as progress:
+        task = progress.add_task("keyframes", total=len(other.known), note="")
+        for each in other.known:
+            view = each.view
+            for candidate in retrieve(view, _CANDIDATES, one.known, appearance):
+                relative = matcher.relative_pose_to(candidate.view, view)
+                if relative is not None and matcher.is_beyond_chance(relative):
+                    shared = replace(relative, covariance=max(relative.clustering, 1.0) * relative.covariance)
+                    at = from_origin(candidate, shared)
+                    spread = turn_covariance(at.T_key_camera, at.covariance)
+                    links.append((each, Link(candidate.origin, at.T_key_camera, spread, int(at.inliers.sum()))))
+                    break
+            progress.advance(task)
     links.sort(key=lambda pair: -pair[1].inliers)
     for first, second in itertools.combinations(links, 2):
         if _agree(one, other, first, second):
@@ -155,16 +166,3 @@ def _agree(one: MapFile, other: MapFile, first: Found, second: Found) -> bool:
     for each in (link, check):
         covariance = covariance + turn_covariance(one.past.poses[each.origin], each.covariance)
     return bool(departure @ np.linalg.solve(covariance, departure) <= CHI_SQUARE_9999_OF_6)
-
-
-def main() -> None:
-    """Entry point."""
-    maps = [MapFile(Path(each)) for each in sys.argv[1:3]]
-    print(*(each.describe() for each in maps), sep="\n\n")
-    if len(maps) == 2:
-        save_arrays(Path(sys.argv[3]), **merge(*maps))
-        print(f"\n{MapFile(Path(sys.argv[3])).describe()}")
-
-
-if __name__ == "__main__":
-    main()
