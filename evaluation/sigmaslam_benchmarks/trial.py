@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from sigmaslam.slam.tracker import TrackerConfig
     from sigmaslam_synthetic.simulation import Recipe
 
-_EUROC_TRUTH = Path("mav0") / "state_groundtruth_estimate0" / "data.csv"
 
 Method = Callable[[StereoSequence, Path], object]
 """Writes what it makes of a sequence into a new run folder: `track_ours`, or another one with its arguments."""
@@ -164,12 +163,6 @@ def render(folder: Path, recipe: Recipe, workers: int, done: Callable[[int], Non
     source = folder / f"{recipe.name}-{hash_renderer()[:8]}"
     write_sequence(source, recipe, "sparse", workers, done=done)
     return source
-
-
-def rendered_truth(source: Path) -> Path:
-    """The file of the true poses in a rendered folder, of either layout."""
-    truth = source / _EUROC_TRUTH
-    return truth if truth.is_file() else source / "poses.txt"
 
 
 @dataclass(frozen=True, slots=True)

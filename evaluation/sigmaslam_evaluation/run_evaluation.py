@@ -13,7 +13,13 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import has_matplotlib
-from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
+from sigmaslam.readers.trajectory_files import (
+    find_truth,
+    kitti_times_path,
+    read_covariances,
+    read_trajectory,
+    trajectory_format,
+)
 from sigmaslam.report.figures import save_png
 from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
@@ -77,7 +83,7 @@ def evaluate_run(
         run_or_trajectory: a folder with `trajectory.tum` (and `covariance.npy`, (N, 6, 6) in the body frame;
             `trajectory_final.tum` and its covariance are evaluated beside them), or a TUM or KITTI file. Poses
             relative to earlier ones are judged where it holds `relative_poses.npz`.
-        truth: TUM, KITTI, or EuRoC ground truth.
+        truth: TUM, KITTI, or EuRoC ground truth, or a folder with one of a usual name.
         lengths, step: segments of the KITTI errors (see `kitti_errors`).
         plot: write `evaluation.png` into the run folder or beside the trajectory, where matplotlib is installed; of a
             run also `evaluation.json` and `evaluation.npz`, with which its report is written anew.
@@ -89,7 +95,7 @@ def evaluate_run(
     Raises:
         InputError: a file is missing or wrong, no frame has a pose, or the timestamps do not meet.
     """
-    run_or_trajectory, truth = Path(run_or_trajectory), Path(truth)
+    run_or_trajectory, truth = Path(run_or_trajectory), find_truth(Path(truth))
     is_run = run_or_trajectory.is_dir()
     estimate_path = run_or_trajectory / "trajectory.tum" if is_run else run_or_trajectory
     frames = None

@@ -41,7 +41,9 @@ class Unit(StrEnum):
 
 def evaluate(
     run: Annotated[Path, typer.Argument(metavar="RUN_OR_TRAJECTORY", help="Run folder, or a TUM or KITTI file.")],
-    truth: Annotated[Path, typer.Option(help="Ground truth: TUM, KITTI (with times.txt beside it) or EuRoC csv.")],
+    truth: Annotated[
+        Path, typer.Option(help="TUM, KITTI (with times.txt beside it) or EuRoC csv, or the recording's folder.")
+    ],
     truth_kind: Annotated[
         Kind | None,
         typer.Option(help="What measured the truth: GPS/INS, motion capture, or nothing, as a render's is exact."),

@@ -129,7 +129,7 @@ class Scrutiny:
             stays = moves[now] & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
             is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves[now].sum()
             self._fixed_for = _SPOILT if is_fixed else max(self._fixed_for - 1, 0)
-            self._before = left.copy(), fit.pose, ids, seen
+            self._before = left, fit.pose, ids, seen
         elif 2 * (ways > ACCEPTANCE.stands).sum() < len(ways) and shows_motion(image, left):
             return True
         return self._fixed_for > 0

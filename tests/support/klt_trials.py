@@ -6,10 +6,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from sigmaslam.readers.trajectory_files import find_truth
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
-from sigmaslam_benchmarks.trial import Trial, rendered_truth
+from sigmaslam_benchmarks.trial import Trial
 from sigmaslam_synthetic.simulation import Recipe
 
 METHODS = {"KLT + PnP": TrackerConfig()}
@@ -29,7 +30,7 @@ def judge_klt(source: Path, recipe: Recipe, method: str) -> ErrorFigures:
     if recipe.seed == 13:
         raise ValueError("13 is unlucky")
     trial = Trial(
-        open_rendered(source), rendered_truth(source), lambda sequence, out: track_with_peer(sequence, out, "klt-pnp")
+        open_rendered(source), find_truth(source), lambda sequence, out: track_with_peer(sequence, out, "klt-pnp")
     )
     evaluation = trial.run().evaluation
     steps = evaluation.rpe

@@ -15,11 +15,11 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.readers.inertial import InertialRecording, find_imu, read_imu
 from sigmaslam.readers.selection import Selection
-from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.readers.trajectory_files import find_truth, read_trajectory
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import References
 from sigmaslam_benchmarks.rendered_camera import open_rendered
-from sigmaslam_benchmarks.trial import render, rendered_truth
+from sigmaslam_benchmarks.trial import render
 from sigmaslam_evaluation.metrics.trajectory_errors import associate
 from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
 
@@ -63,7 +63,7 @@ class Recording:
         """Reads the frames; renders what is missing into the folder `runs`."""
         if self.exact:
             source = render(runs, self._recipe(), 1)
-            return _read(open_rendered(source), source, read_trajectory(rendered_truth(source)), np.zeros((6, 6)))
+            return _read(open_rendered(source), source, read_trajectory(find_truth(source)), np.zeros((6, 6)))
         assert data is not None
         folder, truth, sigmas = REAL[self.kind]
         sequence = open_sequence(data / folder).select(Selection(count=self.frames))

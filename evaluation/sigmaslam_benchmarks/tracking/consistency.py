@@ -13,7 +13,7 @@ import torch
 
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.readers.trajectory_files import find_truth, read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
@@ -27,7 +27,7 @@ from sigmaslam_benchmarks.tracking.consistency_page import (
     format_page,
 )
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam_benchmarks.trial import Trial, rendered_truth, track_ours
+from sigmaslam_benchmarks.trial import Trial, track_ours
 from sigmaslam_evaluation.metrics import map_consistency as consistency
 from sigmaslam_synthetic.render_sequence import SCENE_NAME
 from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
@@ -124,7 +124,7 @@ def depths_around(studio: Studio, frame: int, pixels: np.ndarray) -> np.ndarray:
 
 
 def _track(source: Path, recipe: Recipe, method: str) -> ConsistencyResult:
-    truth = rendered_truth(source)
+    truth = find_truth(source)
     # The others are given what is right but for the offset, which is estimated.
     sequence, config, drawn = open_rendered(source), METHODS[method], method.endswith(DRAWN)
     if drawn:

@@ -16,9 +16,10 @@ from sigmaslam.files import atomic_path, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import list_images
+from sigmaslam.readers.trajectory_files import find_truth
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page
-from sigmaslam_benchmarks.trial import Trial, render, rendered_truth, track_ours
+from sigmaslam_benchmarks.trial import Trial, render, track_ours
 from sigmaslam_synthetic.camera.sensor import Sensor, expose
 from sigmaslam_synthetic.simulation import Recipe
 
@@ -236,7 +237,7 @@ def _track(source: Path, denoise: bool) -> list[str]:
     """Error and frames that were tracked."""
     method = partial(track_ours, tracker=TrackerOptions(threads=1, denoise=denoise))
     try:
-        result = Trial(source, rendered_truth(source), method).run()
+        result = Trial(source, find_truth(source), method).run()
     except InputError:
         return ["lost", "0"]
     return [f"{1e3 * result.evaluation.ate.rmse:.1f}", str(int(result.tracked.sum()))]

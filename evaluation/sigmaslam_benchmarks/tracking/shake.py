@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.readers.trajectory_files import find_truth, read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
@@ -19,7 +19,7 @@ from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, read_image_m
 from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
 from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
-from sigmaslam_benchmarks.trial import Method, Trial, rendered_truth, track_ours
+from sigmaslam_benchmarks.trial import Method, Trial, track_ours
 from sigmaslam_evaluation.metrics.map_consistency import coverage
 from sigmaslam_synthetic.presets import PRESETS
 from sigmaslam_synthetic.render_choices import CARRIED
@@ -86,7 +86,7 @@ def recipe(number: int, first_seed: int) -> Recipe:
 
 def judge(source: Path, method: Method) -> ShakeResult:
     """Tracks a rendered folder and holds it against its truth."""
-    truth = rendered_truth(source)
+    truth = find_truth(source)
     with tempfile.TemporaryDirectory() as scratch:
         run = Path(scratch) / "run"
         with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
