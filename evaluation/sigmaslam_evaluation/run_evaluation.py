@@ -14,7 +14,6 @@ from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import has_matplotlib
 from sigmaslam.readers.trajectory_files import (
-    find_truth,
     kitti_times_path,
     read_covariances,
     read_trajectory,
@@ -43,6 +42,7 @@ from sigmaslam_evaluation.truth_conventions import (
     describe_mirror,
     find_convention,
     find_time_unit,
+    find_truth,
     scale_times,
 )
 from sigmaslam_evaluation.truth_errors import (

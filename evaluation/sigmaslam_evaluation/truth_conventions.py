@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, replace
 from itertools import product
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,27 @@ _ALIKE = 2.0
 # The axes of a camera (x right, y down, z ahead) in a body with x ahead, y left and z up.
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 TIME_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+# Names that truths have in recordings' folders.
+_TRUTHS = (
+    "groundtruth.tum",
+    "groundtruth.txt",
+    "poses.txt",
+    "mav0/state_groundtruth_estimate0/data.csv",
+    "mav0/mocap0/data.csv",
+    "groundtruth.csv",
+)
+
+
+def find_truth(path: Path) -> Path:
+    """The true poses of a recording's folder; `path` itself if it is none.
+
+    Raises:
+        InputError: the folder has no file of a usual name.
+    """
+    found = [path / name for name in _TRUTHS if (path / name).is_file()] if path.is_dir() else [path]
+    if not found:
+        raise InputError(f"{path}: a folder without {', '.join(_TRUTHS)}; give the file of the true poses")
+    return found[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,16 +19,6 @@ TrajectoryFormat = Literal["tum", "kitti", "euroc"]
 KITTI_FRAME_RATE = 10.0
 """Frames per second of KITTI, used where a pose file has no times.txt."""
 
-# Names that truths have in recordings' folders.
-_TRUTHS = (
-    "groundtruth.tum",
-    "groundtruth.txt",
-    "poses.txt",
-    "mav0/state_groundtruth_estimate0/data.csv",
-    "mav0/mocap0/data.csv",
-    "groundtruth.csv",
-)
-
 
 def trajectory_format(path: str | Path) -> TrajectoryFormat:
     """The format, from the first line that is not a comment.
@@ -52,18 +42,6 @@ def trajectory_format(path: str | Path) -> TrajectoryFormat:
             "12 (KITTI: 3x4 matrix by rows), or commas (EuRoC ground truth)"
         )
     raise InputError(f"{path}: holds no poses; give a trajectory in TUM, KITTI or EuRoC form")
-
-
-def find_truth(path: Path) -> Path:
-    """The true poses of a recording's folder; `path` itself if it is none.
-
-    Raises:
-        InputError: the folder has no file of a usual name.
-    """
-    found = [path / name for name in _TRUTHS if (path / name).is_file()] if path.is_dir() else [path]
-    if not found:
-        raise InputError(f"{path}: a folder without {', '.join(_TRUTHS)}; give the file of the true poses")
-    return found[0]
 
 
 def read_trajectory(path: str | Path) -> Trajectory:

@@ -13,7 +13,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, write_kitti, write_tum
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
-from sigmaslam_evaluation.truth_conventions import TIME_UNITS, TruthConvention
+from sigmaslam_evaluation.truth_conventions import TIME_UNITS, TruthConvention, find_truth
 from tests.support.commands import assert_refused, run_here
 
 KITTI = ("04", "05", "07", "10")
@@ -197,3 +197,14 @@ def test_the_turn_about_a_straight_path_is_not_reported_as_an_error(tmp_path: Pa
         assert (evaluation.ate.turn_deg < 1) == determined
         assert ("not determined" in format_evaluation(evaluation)) != determined
         assert evaluation.ate_origin.turn_deg == 0
+
+
+def test_the_truth_of_a_folder_is_found_by_its_usual_names(tmp_path):
+    with pytest.raises(InputError, match=r"folder without groundtruth\.tum, .* give the file"):
+        find_truth(tmp_path)
+    euroc = tmp_path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    euroc.parent.mkdir(parents=True)
+    euroc.touch()
+    assert find_truth(tmp_path) == find_truth(euroc) == euroc
+    # What a file is not is said where it is read.
+    assert find_truth(tmp_path / "nowhere.txt") == tmp_path / "nowhere.txt"

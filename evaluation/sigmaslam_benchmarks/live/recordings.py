@@ -15,13 +15,14 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import StereoSequence, open_sequence
 from sigmaslam.readers.inertial import InertialRecording, find_imu, read_imu
 from sigmaslam.readers.selection import Selection
-from sigmaslam.readers.trajectory_files import find_truth, read_trajectory
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
 from sigmaslam_benchmarks.live.judge import References
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.trial import render
 from sigmaslam_evaluation.metrics.trajectory_errors import associate
 from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
+from sigmaslam_evaluation.truth_conventions import find_truth
 
 if TYPE_CHECKING:
     from sigmaslam_synthetic.simulation import Recipe

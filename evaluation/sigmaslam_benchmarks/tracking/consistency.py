@@ -13,7 +13,7 @@ import torch
 
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.readers.trajectory_files import find_truth, read_trajectory
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
@@ -29,6 +29,7 @@ from sigmaslam_benchmarks.tracking.consistency_page import (
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Trial, track_ours
 from sigmaslam_evaluation.metrics import map_consistency as consistency
+from sigmaslam_evaluation.truth_conventions import find_truth
 from sigmaslam_synthetic.render_sequence import SCENE_NAME
 from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
 

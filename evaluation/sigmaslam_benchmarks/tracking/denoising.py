@@ -16,10 +16,10 @@ from sigmaslam.files import atomic_path, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import list_images
-from sigmaslam.readers.trajectory_files import find_truth
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from sigmaslam_benchmarks.trial import Trial, render, track_ours
+from sigmaslam_evaluation.truth_conventions import find_truth
 from sigmaslam_synthetic.camera.sensor import Sensor, expose
 from sigmaslam_synthetic.simulation import Recipe
 

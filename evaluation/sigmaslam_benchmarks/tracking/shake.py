@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.readers.trajectory_files import find_truth, read_trajectory
+from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
@@ -21,6 +21,7 @@ from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Method, Trial, track_ours
 from sigmaslam_evaluation.metrics.map_consistency import coverage
+from sigmaslam_evaluation.truth_conventions import find_truth
 from sigmaslam_synthetic.presets import PRESETS
 from sigmaslam_synthetic.render_choices import CARRIED
 from sigmaslam_synthetic.simulation import Recipe

@@ -13,7 +13,6 @@ from sigmaslam.geometry.se3 import rotation_exp, se3_exp
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.pairing import in_seconds
 from sigmaslam.readers.trajectory_files import (
-    find_truth,
     read_covariances,
     read_euroc_truth,
     read_kitti,
@@ -240,14 +239,3 @@ def test_covariances_come_back_in_float64(tmp_path):
     read = read_covariances(tmp_path / "covariance.npy", 4)
     assert read.dtype == np.float64
     np.testing.assert_array_equal(read, array)
-
-
-def test_the_truth_of_a_folder_is_found_by_its_usual_names(tmp_path):
-    with pytest.raises(InputError, match=r"folder without groundtruth\.tum, .* give the file"):
-        find_truth(tmp_path)
-    euroc = tmp_path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-    euroc.parent.mkdir(parents=True)
-    euroc.touch()
-    assert find_truth(tmp_path) == find_truth(euroc) == euroc
-    # What a file is not is said where it is read.
-    assert find_truth(tmp_path / "nowhere.txt") == tmp_path / "nowhere.txt"
