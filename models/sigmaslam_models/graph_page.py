@@ -40,7 +40,7 @@ def graph_page(folder: Path, command: str) -> tuple[str, str]:
     table = io.StringIO()
     rows = ((graph["name"], *row) for graph in graphs for row in graph["rows"])
     csv.writer(table, lineterminator="\n").writerows([("graph", "", "name", "type", "shape", "meaning"), *rows])
-    return fill_template("onnx.md", command=command, graphs=graphs), table.getvalue()
+    return fill_template("onnx.md", command=command, graphs=graphs, table="onnx.csv"), table.getvalue()
 
 
 def _describe(name: str, path: Path) -> dict[str, Any]:
