@@ -2,6 +2,7 @@
 
 import ast
 import re
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -33,6 +34,12 @@ def test_the_notebook_s_rows_are_dated_in_order_and_say_what_became_of_them():
         assert all(re.match(r"20\d\d-\d\d-\d\d [0-9a-f]{7}$", row[0]) for row in cells), section
         assert [row[0][:10] for row in cells] == sorted(row[0][:10] for row in cells), section
         assert all(len(row) == 4 and re.match("kept|not kept|mended|open", row[3]) for row in cells), section
+
+
+def test_tables_beside_pages_ship_with_them():
+    shipped = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["data-files"]
+    patterns = [pattern for each in shipped.values() for pattern in each]
+    assert {path for pattern in patterns for path in ROOT.glob(pattern)} >= set((ROOT / "docs").rglob("*.csv"))
 
 
 def test_headings_become_anchors_as_github_makes_them():

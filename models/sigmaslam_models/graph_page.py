@@ -1,6 +1,7 @@
-"""The page of the graphs that ship: what each takes and gives, read from the files, and a short text of ours."""
+"""The page of the graphs that ship, and the table beside it: what each takes and gives, read from the files."""
 
-from collections import Counter
+import csv
+import io
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -13,8 +14,6 @@ from sigmaslam.errors import InputError
 from sigmaslam_models.model_card import fill_template
 
 PAGE_COMMAND = "sigmaslam train export --page docs/onnx.md"
-SHARED = 3
-"""Graphs with the same input from which on it is told once, ahead of them all."""
 _UNKNOWN = {"purpose": "No text yet: `models/sigmaslam_models/graph_texts.yaml`.", "meanings": {}}
 
 
@@ -25,8 +24,8 @@ def graph_texts() -> dict[str, dict[str, Any]]:
     return dict(yaml.safe_load(text)["graphs"])
 
 
-def graph_page(folder: Path, command: str) -> str:
-    """Markdown page of all graphs in a folder.
+def graph_page(folder: Path, command: str) -> tuple[str, str]:
+    """Markdown page of all graphs in a folder, and the table (CSV) of their inputs and outputs.
 
     Args:
         folder: with .onnx files; those of which nothing is known here come last.
@@ -38,9 +37,10 @@ def graph_page(folder: Path, command: str) -> str:
         raise InputError(f"{folder} has no .onnx files: give the folder that `sigmaslam train export` wrote")
     names = [*(name for name in graph_texts() if name in paths), *(name for name in paths if name not in graph_texts())]
     graphs = [_describe(name, paths[name]) for name in names]
-    counts = Counter(row for graph in graphs for row in graph["rows"])
-    shared = [row for row, count in counts.items() if count >= SHARED]
-    return fill_template("onnx.md", command=command, graphs=graphs, shared=shared)
+    table = io.StringIO()
+    rows = ((graph["name"], *row) for graph in graphs for row in graph["rows"])
+    csv.writer(table, lineterminator="\n").writerows([("graph", "", "name", "type", "shape", "meaning"), *rows])
+    return fill_template("onnx.md", command=command, graphs=graphs, table="onnx.csv"), table.getvalue()
 
 
 def _describe(name: str, path: Path) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def _rows(model: onnx.ModelProto, meanings: dict[str, str]) -> Iterator[tuple[st
             kind = onnx.helper.tensor_dtype_to_np_dtype(tensor.elem_type).name
             lengths = [_length(each) for each in tensor.shape.dim]
             shape = ", ".join(lengths) + ("," if len(lengths) == 1 else "")
-            yield way, value.name, kind, shape, meanings.get(value.name, "")
+            yield way, value.name, kind, f"({shape})", meanings.get(value.name, "")
 
 
 def _length(dimension: onnx.TensorShapeProto.Dimension) -> str:

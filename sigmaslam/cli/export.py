@@ -20,7 +20,7 @@ def export(
         bool, typer.Option("--check", help="Compare the graphs that ship with torch; without RUN.")
     ] = False,
     page: Annotated[
-        Path | None, typer.Option(help="Write a page (Markdown) of the graphs that ship; without RUN.")
+        Path | None, typer.Option(help="Write a page (Markdown, and CSV) of the graphs that ship; without RUN.")
     ] = None,
 ) -> None:
     """Export what a run made to ONNX and check the graphs against torch (needs the extra 'train').
@@ -65,7 +65,8 @@ def _tell_of_shipped(check: bool, page: Path | None) -> None:
 
     folder = shipped_weights("features.onnx").parent
     if page is not None:
-        atomic_write_text(page, graph_page(folder, PAGE_COMMAND))
+        for path, text in zip((page, page.with_suffix(".csv")), graph_page(folder, PAGE_COMMAND), strict=True):
+            atomic_write_text(path, text)
     if check:
         _tell_differences(check_graphs(folder))
 

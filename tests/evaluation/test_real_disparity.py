@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -70,12 +71,15 @@ def test_the_page_has_every_set_and_method(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(real_disparity, "real_pairs", lambda data: {"drive": [_pair(20.0, 400.0)]})
     monkeypatch.setattr(real_disparity, "rendered_pairs", lambda seeds: {"room": [_pair()]})
     page = write_real(tmp_path / "page.md", tmp_path, "command")
-    for name in ("drive", "room", "room, worse camera"):
-        assert page.count(f"| {name} | ours |") == 1
-        assert page.count(f"| {name} | SGBM") == 2
-    assert "## Ours on the drive, by distance, metres" in page
-    assert "| 10 | 20 |" not in page
-    assert "| 20 | 40 | 100.0% |" in page
+    assert page.count("| drive | ours |") == 1
+    assert page.count("| drive | SGBM") == 2
+    with (tmp_path / "page.renders.csv").open() as table:
+        renders = [(name, method[:4]) for name, method, *_ in list(csv.reader(table))[1:]]
+    assert renders == [(name, each) for name in ("room", "room, worse camera") for each in ("ours", "SGBM", "SGBM")]
+    assert "Ours on the drive, by distance, metres:" in page
+    distances = (tmp_path / "page.by-distance.csv").read_text()
+    assert "\n10,20," not in distances
+    assert "\n20,40,100.0%," in distances
 
 
 def test_data_that_is_not_there_is_named(tmp_path: Path):

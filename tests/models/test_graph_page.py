@@ -17,7 +17,9 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "onnx.md"
 
 
 def test_the_page_is_that_of_the_files_that_ship():
-    assert PAGE.read_text() == graph_page(WEIGHTS, PAGE_COMMAND), f"run `{PAGE_COMMAND}`"
+    page, table = graph_page(WEIGHTS, PAGE_COMMAND)
+    assert PAGE.read_text() == page, f"run `{PAGE_COMMAND}`"
+    assert PAGE.with_suffix(".csv").read_text() == table, f"run `{PAGE_COMMAND}`"
 
 
 @pytest.mark.parametrize("path", sorted(WEIGHTS.glob("*.onnx")), ids=lambda path: path.stem)
@@ -52,4 +54,6 @@ def test_a_graph_that_nobody_knows_is_named(tmp_path):
     shutil.copy(WEIGHTS / "verifier.onnx", tmp_path / "other.onnx")
     with pytest.raises(InputError, match=r"other\.onnx"):
         check_graphs(tmp_path)
-    assert "## other.onnx" in graph_page(tmp_path, "command")
+    page, table = graph_page(tmp_path, "command")
+    assert "| `other.onnx` |" in page
+    assert "\nother,in,columns,float32," in table

@@ -1,7 +1,7 @@
 """Scores of an extractor on the sets, and their table."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -76,21 +76,23 @@ def _summarize_parts(pairs: Sequence[ImagePair], pair_scores: Sequence[dict[str,
     }
 
 
-def format_scores(results: Mapping[str, Scores]) -> str:
+def format_scores(results: Mapping[str, Scores], beside: Collection[str] = ()) -> str:
     """Markdown tables, one a set with a row for each extractor; shares and areas in percent.
 
     Args:
         results: by name of the extractor, as `compare` gives them.
+        beside: sets whose tables go beside the page, as of `write_page`.
     """
     lines = []
     for name in dict.fromkeys(name for scores in results.values() for name in scores):
         rows = {extractor: scores[name] for extractor, scores in results.items() if name in scores}
         names = dict.fromkeys(column for row in rows.values() for column in row)
         columns = [column for column in names if not _UNLISTED.fullmatch(column)]
-        lines += [f"## {name}", "", "| extractor | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
+        lines += [f"{name}:", f"<!-- rows {name} -->"] if name in beside else [f"## {name}", ""]
+        lines += ["| extractor | " + " | ".join(columns) + " |", "|---|" + "---:|" * len(columns)]
         for extractor, row in rows.items():
             lines.append(f"| {extractor} | " + " | ".join(_number(column, row) for column in columns) + " |")
-        lines.append("")
+        lines += ["<!-- end -->", ""] if name in beside else [""]
     return "\n".join(lines)
 
 

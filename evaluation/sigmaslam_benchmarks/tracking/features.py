@@ -27,6 +27,8 @@ ROUNDS = 15
 _HEIGHT, _WIDTH = 480, 640
 _SESSIONS = 3
 _SEED = 0
+# Sets whose tables are beside the page.
+_BESIDE = ("middlebury", "churchill", "kitti", "euroc", "kitti_tracks")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,7 @@ def write_features(
         rounds=rounds,
         reference=Path(reference).name,
         costs=cost_rows(costs, reference),
-        scores=format_scores(scores),
+        scores=format_scores(scores, _BESIDE),
     )
     return write_page(path, _public(page))
 

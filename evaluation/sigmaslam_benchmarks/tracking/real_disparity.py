@@ -63,6 +63,7 @@ class JudgedDisparities(Table):
 def write_real(path: Path, data: Path, command: str) -> str:
     """Judges all methods on all sets, writes the page and returns it; notes in it are kept."""
     sets = real_pairs(data)
+    real = list(sets)
     rendered = rendered_pairs((SEED,))
     rng = np.random.default_rng(SEED)
     sets |= rendered
@@ -86,6 +87,7 @@ def write_real(path: Path, data: Path, command: str) -> str:
         "real_disparity",
         command,
         seed=SEED,
+        real=real,
         rows=list(_rows(list(sets), list(methods), judged, seconds)),
         split_set=next(iter(sets)),
         splits={

@@ -34,7 +34,13 @@ _QUANTITIES = (
     "Milliseconds a frame",
 )
 # Tables beside the page, by their names.
-_ASIDE = {"Step error, mm": "steps", "Disparity offset, pixels": "offsets"}
+_ASIDE = {
+    "t_rel, %": "t_rel",
+    "Step error, mm": "steps",
+    "Forward noise, mm": "forward",
+    "Disparity offset, pixels": "offsets",
+    "Milliseconds a frame": "ms",
+}
 
 
 @dataclass(frozen=True, slots=True)

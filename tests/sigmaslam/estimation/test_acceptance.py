@@ -1,5 +1,6 @@
-"""The page of the rules of acceptance says what the object holds."""
+"""The table of the rules of acceptance says what the object holds."""
 
+import csv
 import re
 from dataclasses import fields
 from fractions import Fraction
@@ -8,11 +9,8 @@ from pathlib import Path
 from sigmaslam.estimation.acceptance import ACCEPTANCE, Acceptance
 
 ROOT = Path(__file__).resolve().parents[3]
-ROWS = re.findall(
-    r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \| `([^`|]+)` \| ([^|]+) \| ([^|]+) \|$",
-    (ROOT / "docs" / "acceptance.md").read_text(),
-    re.MULTILINE,
-)
+with (ROOT / "docs" / "acceptance.csv").open(encoding="utf-8") as table:
+    ROWS = [row[1:] for row in csv.reader(table)][1:]
 
 
 def test_the_page_lists_exactly_the_rules_and_their_values():
