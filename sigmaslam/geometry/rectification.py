@@ -12,6 +12,8 @@ MAX_TANGENT = float(np.tan(np.radians(60.0)))
 # A rectified pixel is valid if its source is at least so many pixels from the image border.
 VALID_MARGIN = 3
 _BORDER_SAMPLES = 200
+# Of an image, which fit into the cache with all that is computed of them.
+_ROWS_AT_ONCE = 16
 
 
 class StereoRectifier:
@@ -164,10 +166,13 @@ def _inner_rectangle(model: CameraModel, R: np.ndarray) -> np.ndarray:
 
 def _source_pixels(model: CameraModel, view: RectifiedStereo, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each rectified pixel, (H, W) float32 u and v of its place in the original image."""
-    grid = np.stack(np.meshgrid(np.arange(view.width), np.arange(view.height)), axis=-1)
-    rays = view.rays(grid) @ R
-    pixels = np.where(rays[..., 2:] > 0, model.project(rays), -1.0).astype(np.float32)
-    return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+    source = np.empty((2, view.height, view.width), np.float32)
+    for top in range(0, view.height, _ROWS_AT_ONCE):
+        rows = np.arange(top, min(top + _ROWS_AT_ONCE, view.height))
+        rays = view.rays(np.stack(np.meshgrid(np.arange(view.width), rows), axis=-1)) @ R
+        pixels = np.where(rays[..., 2:] > 0, model.project(rays), -1.0)
+        source[:, rows] = np.moveaxis(pixels, -1, 0)
+    return source[0], source[1]
 
 
 def _valid_mask(model: CameraModel, u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 _REMEMBERED = 8
 # Rows that are compared first: an old part of an eighth of the image holds two of them.
 _PROBES = 16
-# Side of the blocks whose means are compared, pixels.
-_BLOCK = 8
+# Side of the blocks whose means are compared, pixels, and rows of them at a time.
+_BLOCK, _BAND = 8, 8
 # Share of neighbouring pixels that differ, in what is no even surface: in noise almost all do.
 _VARIED = 0.1
 # Grey values: no sensor is noisier in the dark.
@@ -57,15 +57,22 @@ def is_noise(image: np.ndarray) -> bool:
 
     Means of blocks of white noise differ as its pixels do, in proportion; those of scenes differ by far more.
     """
+    steps = cv2.absdiff(image[:, 1:], image[:, :-1])
+    within = cv2.norm(steps, cv2.NORM_L2SQR) / steps.size
+    # Neither a few bright pixels of a black image nor more than any sensor's noise.
+    if cv2.countNonZero(steps) <= _VARIED * steps.size or within >= 2.0 * _MOST_NOISE**2:
+        return False
     rows, columns = (max(size // _BLOCK, 2) for size in image.shape)
     tall, broad = image.shape[0] // rows, image.shape[1] // columns
-    whole = image[: rows * tall, : columns * broad].astype(np.float32)
-    blocks = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
-    steps = cv2.absdiff(image[:, 1:], image[:, :-1])
-    between, within = float(np.mean(np.diff(blocks, axis=1) ** 2)), cv2.norm(steps, cv2.NORM_L2SQR) / steps.size
-    # Neither a few bright pixels of a black image nor more than any sensor's noise.
-    is_possible = cv2.countNonZero(steps) > _VARIED * steps.size and within < 2.0 * _MOST_NOISE**2
-    return bool(is_possible and tall * broad * between < ACCEPTANCE.noise_contrast * within)
+    left = ACCEPTANCE.noise_contrast * within * rows * (columns - 1) / (tall * broad)
+    for top in range(0, rows, _BAND):  # the first one tells most scenes
+        count = min(_BAND, rows - top)
+        band = image[top * tall : (top + count) * tall, : columns * broad].astype(np.float32)
+        blocks = cv2.resize(band, (columns, count), interpolation=cv2.INTER_AREA)
+        left -= float(np.sum(np.diff(blocks, axis=1) ** 2))
+        if left <= 0.0:
+            return False
+    return True
 
 
 def shows_motion(before: np.ndarray, now: np.ndarray) -> bool:
