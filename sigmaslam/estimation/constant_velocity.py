@@ -110,16 +110,11 @@ class MotionFilter:
         """The prediction is off by more than it claims: all its variances are so many times as large."""
         self._covariance, self.widened = factor * self._covariance, factor * self.widened
 
-    def doubt_time(self, seconds: float) -> np.ndarray:
-        """The image is of another moment, by so much: that, and no error of the velocity, makes the prediction wide.
-
-        Returns:
-            (6,) the way in that time, perturbed from the left in the keyframe.
-        """
+    def doubt_time(self, seconds: float) -> None:
+        """The image is of another moment, by so much: that, and no error of the velocity, makes the prediction wide."""
         error = self.way(seconds)
         self.widen(1.0 / self.widened)
         self._covariance[_POSE, _POSE] += np.outer(error, error)
-        return error
 
     def restore(self, state: MotionState, widened: float) -> None:
         """Takes an earlier state of constant velocity back, to the bit."""

@@ -13,7 +13,7 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.gaussian import step_with
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.prediction_errors import surprise, time_error
-from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, transform_points
+from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.frozen_images import shows_motion
 from sigmaslam.slam.guided_matching import GuidedMatches
@@ -46,7 +46,7 @@ class Scrutiny:
         # Places are all that is asked of it; a torn image leaves none in the next one.
         self._rival = MovingRegion(0.0, patience=0)
         self._T_rival_fit = np.eye(4)
-        self._last_error = 0.0
+        self._last_error, self._had_other_times = 0.0, False
         self._input_is_wrong = input_is_wrong
         self._before: tuple[np.ndarray, ...] | None = None
         self._fixed_for = 0
@@ -142,13 +142,15 @@ class Scrutiny:
         return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
     def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
-        key = self._window.posterior.poses[-1]
-        step = se3_inverse(key) @ fit.pose
-        error = time_error(self._motion, step, self._clock.interval)
+        step = se3_inverse(self._window.posterior.poses[-1]) @ fit.pose
+        error = time_error(self._motion, step, self._clock.interval, self._had_other_times)
         # What goes on is an acceleration: images out of order jump to and fro.
         if error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0):
-            doubts.add(Doubt.TIME, se3_adjoint(key) @ self._motion.doubt_time(error * self._clock.interval))
-            doubts.prediction_is_wrong = True
+            doubts.add(Doubt.TIME)
+            self._motion.doubt_time(error * self._clock.interval)
+            # The pose at the stamp is the prediction, as uncertain as it was before, and the image's is off by a way.
+            doubts.spread = doubts.spread + Prediction.of(self._window, self._motion).covariance
+            doubts.prediction_is_wrong = self._had_other_times = True
         elif (excess := surprise(self._motion, step)) > 1.0:
             self._motion.widen(excess)
             doubts.prediction_is_wrong = True

@@ -44,6 +44,15 @@ def test_noise_aside_does_not_hide_a_wrong_time():
     assert time_error(motion, seen(motion, 1.5, 2.0 * aside), INTERVAL) == 0.0
 
 
+def test_less_speaks_for_another_time_where_the_driver_is_known_to_exchange_images():
+    motion = driving()
+    motion.set_twist(0.08 * FORWARD, np.full(6, 0.05))
+    late, brake = seen(motion, 1.0), seen(motion, -0.3)
+    assert time_error(motion, late, INTERVAL) == 0.0
+    assert time_error(motion, late, INTERVAL, expected=True) == pytest.approx(1.0, rel=1e-6)
+    assert time_error(motion, brake, INTERVAL, expected=True) == 0.0
+
+
 def test_a_camera_at_rest_shows_no_time():
     motion = driving()
     motion.set_twist(0.001 * FORWARD, np.full(6, 0.05))
