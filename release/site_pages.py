@@ -39,8 +39,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             pending += [each for each in linked if each.is_file() and not files.get_file_from_path(site_path(each))]
     for name in PACKAGES:
         # A package without public names of its own shows its modules; `sigmaslam` would show the whole tree.
-        folder = next(ROOT.glob(f"*/{name.replace('.', '/')}"), ROOT / name)
-        init = (folder / "__init__.py").read_text(encoding="utf-8")
+        module = f"{name.replace('.', '/')}/__init__.py"
+        init = next(ROOT.glob(f"*/{module}"), ROOT / module).read_text(encoding="utf-8")
         members = "" if "__all__" not in init else "\n    options:\n      show_submodules: false"
         files.append(File.generated(config, f"reference/{name}.md", content=f"# {name}\n\n::: {name}{members}\n"))
     return files

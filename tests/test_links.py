@@ -20,7 +20,7 @@ def test_links_lead_to_files_and_headings(page: Path):
             continue
         name, _, anchor = target.partition("#")
         path = (page.parent / name).resolve() if name else page
-        assert path.exists(), f"{page.name} links to {target}"
+        assert path.is_file(), f"{page.name} links to {target}"
         if anchor and path.suffix == ".md":
             assert anchor in anchors(path), f"{page.name} links to {target}, where there is no such heading"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from importlib import import_module
 from pathlib import Path
@@ -18,8 +19,8 @@ EQUATIONS, TABLES, FIGURES = 45, 2, 9
 
 
 def rows() -> list[list[str]]:
-    lines = (ROOT / "docs" / "sources.md").read_text().splitlines()
-    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    with (ROOT / "docs" / "sources.csv").open(encoding="utf-8") as table:
+        found = list(csv.reader(table))
     assert found[0] == ["chapter", "what", "function", "command", "test"]
     return found[1:]
 

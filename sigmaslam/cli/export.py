@@ -50,7 +50,6 @@ def export(
             differences = export_scoring(run, out)
         _tell_differences(differences)
         return
-
     on_real_sets = None if scores is None else read_scores(scores)
     with Console(stderr=True).status("exporting eight graphs (some minutes)"):
         differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)

@@ -1,4 +1,4 @@
-"""The rules of acceptance: what lets a pose be said. `docs/acceptance.md` says where each acts and who measured it."""
+"""The rules of acceptance: what lets a pose be said. `docs/acceptance.csv` says where each acts and who measured it."""
 
 from __future__ import annotations
 
