@@ -1,5 +1,7 @@
 """Relative pose without a prediction (9.5.1): 5-point method with scale from stereo, checked against P3P."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +16,9 @@ from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
 # P3P runs once with each inlier threshold, pixels. The second separates slow movers from the static scene.
 _THRESHOLDS = (2.0, 0.5)
+# Where so many agree with the first one no other pose explains more, unless their variances are that much smaller than
+# claimed: what moves slowly may hide in the claims.
+_CLEAR, _AS_CLAIMED = 0.8, 0.25
 # The true variances may be smaller than the claimed ones by this factor.
 _MIN_SCALE = 1.0 / 16.0
 MIN_POINTS = 8
@@ -56,10 +61,10 @@ def estimate_relative_pose(
     """Pose of the current view in the keyframe, from stereo points and their current measurements.
 
     The essential matrix uses far points and ignores errors of depth, but fails without parallax. P3P on stereo points
-    is the opposite. Both candidates are refined, and the one with the smaller misfit is returned. The misfit is the sum
-    of squared errors in sigmas, each limited to the gate. The number of inliers is a worse criterion: a rotation in
-    place of a translation may agree a little with a moving object and with the scene alike. The claimed sigmas are
-    scaled to the errors of half of the points, as matches may be better than claimed.
+    is the opposite, and stands alone where most agree with it. Candidates are refined, and the one with the smallest
+    misfit is returned: the sum of squared errors in sigmas, each limited to the gate. The number of inliers is a worse
+    criterion: a rotation in place of a translation may agree a little with a moving object and with the scene alike.
+    The claimed sigmas are scaled to the errors of half of the points, as matches may be better than claimed.
 
     Args:
         camera: the rectified pair.
@@ -77,10 +82,19 @@ def estimate_relative_pose(
     points = camera.triangulate(np.where(near[:, None], landmarks, [0.0, 0.0, 1.0]))
     matches = _StereoMatches(camera, landmarks, landmark_sigma, measurement, noise, near * probability)
     near_points, near_pixels = points[near], np.ascontiguousarray(measurement[near, :2])
-    candidates = [
-        _from_essential(camera, points, near, landmarks[:, :2], measurement[:, :2], probability, noise[:, :2, :2]),
-        *(_from_points(camera, near_points, near_pixels, threshold) for threshold in _THRESHOLDS),
-    ]
+    first, share = _from_points(camera, near_points, near_pixels, _THRESHOLDS[0])
+    if first is not None and share >= _CLEAR:
+        pose = _best(matches, [first])
+        agree = 0.0 if pose is None or pose.scale < _AS_CLAIMED else matches.weight @ pose.inliers
+        if agree >= _CLEAR * matches.weight.sum():
+            return pose
+    second, _ = _from_points(camera, near_points, near_pixels, _THRESHOLDS[1])
+    given = points, near, landmarks[:, :2], measurement[:, :2], probability, noise[:, :2, :2]
+    return _best(matches, [_from_essential(camera, *given), first, second])
+
+
+def _best(matches: _StereoMatches, candidates: list[np.ndarray | None]) -> RelativePose | None:
+    """Of poses T_camera_key (4, 4) the one with the smallest misfit once refined."""
     guesses = [guess for guess in candidates if guess is not None and np.isfinite(guess).all()]
     if not guesses:
         return None
@@ -124,9 +138,9 @@ def _from_essential(
 
 def _from_points(
     camera: RectifiedStereo, points: np.ndarray, pixels: np.ndarray, threshold: float
-) -> np.ndarray | None:
-    """T_camera_key from P3P in RANSAC."""
-    succeeded, rotation, translation, _ = cv2.solvePnPRansac(
+) -> tuple[np.ndarray | None, float]:
+    """T_camera_key from P3P in RANSAC, and the share of the points that agree."""
+    succeeded, rotation, translation, inliers = cv2.solvePnPRansac(
         points,
         pixels,
         camera.matrix,
@@ -136,7 +150,7 @@ def _from_points(
         reprojectionError=threshold,
         confidence=0.9999,
     )
-    return _pose(rotation, translation) if succeeded else None
+    return (_pose(rotation, translation), len(inliers) / len(points)) if succeeded else (None, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

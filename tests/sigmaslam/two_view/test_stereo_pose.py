@@ -5,6 +5,7 @@ from sigmaslam.frontend import patch_kernels
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import CELLS, image_cells
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam.two_view import stereo_pose
 from sigmaslam.two_view.stereo_pose import RelativePose, _StereoMatches, estimate_relative_pose
 
 CAMERA = RectifiedStereo(fx=400.0, fy=400.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
@@ -99,6 +100,23 @@ def test_a_slow_mover_before_a_plane_is_told_by_matches_that_are_better_than_the
     assert found.inliers[mover].mean() < 0.1
     assert found.inliers[~mover].mean() > 0.95
     assert found.scale < 0.25
+
+
+def test_p3p_stands_alone_where_most_points_agree(monkeypatch):
+    """As noisy as claimed: neither the essential matrix nor the finer threshold could explain more."""
+    landmarks, truth = points_in_view(300), se3_exp(MOTIONS["general"])
+    measurement = observe(landmarks, truth) + np.random.default_rng(0).normal(0, 0.5, (300, 3))
+    measurement[:30, :2] += 20.0
+    with monkeypatch.context() as patched:
+        patched.setattr(stereo_pose, "estimate_epipolar_pose", lambda *args: pytest.fail("it is not needed"))
+        alone = estimate(landmarks, measurement, sigma=0.5)
+    monkeypatch.setattr(stereo_pose, "_CLEAR", 1.1)
+    other = estimate(landmarks, measurement, sigma=0.5)
+    assert alone is not None
+    assert other is not None
+    assert not alone.inliers[:30].any()
+    assert alone.inliers[30:].mean() > 0.95
+    np.testing.assert_allclose(alone.T_key_camera, other.T_key_camera, atol=1e-5)
 
 
 def test_missing_disparities_are_no_obstacle():
