@@ -12,6 +12,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
 
@@ -40,11 +41,12 @@ class RigWatch:
     """Looks for bumps where a frame does not fit what was known.
 
     Attributes:
-        window, localiser: of the tracker.
+        window, localiser, keyframes: of the tracker.
     """
 
     window: KeyframeWindow
     localiser: Localiser
+    keyframes: Keyframes
 
     def find_change(self, frame: Frame, matches: GuidedMatches, prediction: Prediction) -> RigChange | None:
         """The bump before a frame; None where the left image gives no pose, or the right one fits it as before.
@@ -54,30 +56,30 @@ class RigWatch:
             matches: landmarks that were followed to it, with disparities that may be wrong.
             prediction: of its pose.
         """
-        matches = _left_alone(matches)
+        matches = replace(matches, views=replace(matches.views, measurement=matches.views.measurement * (1, 1, np.nan)))
         fit = self.localiser.fit_near(matches, prediction)
         if fit is None:
             return None
         chosen = matches.views.select(fit.inliers)
         expected = seen_from(self.window, chosen.landmark, fit.pose)[:, 2] + self.window.posterior.calibration[0]
-        known = np.isfinite(expected)
-        left = chosen.measurement[known, :2]
-        right = left - np.column_stack([expected[known], np.zeros(known.sum())])
-        found, ended = lucas_kanade(frame.left, frame.right, left, right, _WINDOW, _LEVELS)
-        back, returned = lucas_kanade(frame.right, frame.left, found, left, _WINDOW, 0)
-        good = ended & returned & (np.linalg.norm(back - left, axis=1) < 1.0)
-        if good.sum() < self.localiser.config.min_inliers:
+        moved = _follow(frame.left, frame.right, np.column_stack([chosen.measurement[:, :2], expected]))
+        before = self.keyframes.active[-1].view
+        usual = _follow(before.left, before.right, before.measured(np.isfinite(before.disparity)))
+        if min(len(moved), len(usual)) < self.localiser.config.min_inliers:
             return None
-        moved = (found - right)[good]
-        shift = np.median(moved, axis=0)
-        spread = _ROBUST * np.median(np.abs(moved - shift), axis=0)
+        # Rows that were off before are an error of the calibration, and no change.
+        shift = np.median(moved, axis=0) - (0.0, np.median(usual[:, 1]))
+        spread = _ROBUST * np.median(np.abs(moved - np.median(moved, axis=0)), axis=0)
         if np.linalg.norm(shift) < ACCEPTANCE.bump or (spread > ACCEPTANCE.bump).any():
             return None
         return RigChange(fit, -float(shift[0]), float(shift[1]))
 
 
-def _left_alone(matches: GuidedMatches) -> GuidedMatches:
-    """The same without disparities."""
-    measurement = matches.views.measurement.copy()
-    measurement[:, 2] = np.nan
-    return replace(matches, views=replace(matches.views, measurement=measurement))
+def _follow(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> np.ndarray:
+    """(M, 2) by how much places of the left image are elsewhere in the right one than (u, v, disparity) (K, 3) say."""
+    uvd = uvd[np.isfinite(uvd).all(axis=1)]
+    expected = uvd[:, :2] - np.outer(uvd[:, 2], (1.0, 0.0))
+    found, ended = lucas_kanade(left, right, uvd[:, :2], expected, _WINDOW, _LEVELS)
+    back, returned = lucas_kanade(right, left, found, uvd[:, :2], _WINDOW, 0)
+    good = ended & returned & (np.linalg.norm(back - uvd[:, :2], axis=1) < 1.0)
+    return np.asarray((found - expected)[good])

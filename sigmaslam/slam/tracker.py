@@ -135,7 +135,7 @@ class StereoTracker:
         self._follower = follower = LandmarkFollower(guided)
         self._localiser = localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
         self._scrutiny = Scrutiny(localiser, self._clock, admission.moving, disparity_error is not None)
-        self._rig_watch = RigWatch(window, self._localiser)
+        self._rig_watch = RigWatch(window, localiser, keyframes)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, motion, unguided, admission, config.min_inliers)

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from sigmaslam.estimation.calibration_correction import change_rig
 from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPrior
-from sigmaslam.estimation.calibration_evidence import HYPOTHESES, CalibrationEvidence, Cause
+from sigmaslam.estimation.calibration_evidence import _ALIKE, HYPOTHESES, CalibrationEvidence, Cause
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.inference.backends import load_step
@@ -44,7 +44,9 @@ def test_probabilities_and_errors_are_those_of_the_measurements(name: str, size:
         odds = PRIOR if moved else 1.0 - PRIOR * len(HYPOTHESES)
         densities[each] = odds * multivariate_normal(np.zeros(COUNT), spread).pdf(measured)
         gain = prior @ slopes.T @ np.linalg.inv(spread)
-        errors[each] = gain @ measured, prior - gain @ slopes @ prior
+        # Errors that views have in common make the mean that much less certain.
+        less = prior @ slopes.T @ np.linalg.inv(spread + (_ALIKE - 1.0) * NOISE**2 * np.eye(COUNT))
+        errors[each] = gain @ measured, prior - less @ slopes @ prior
     causes = weigh(slopes, measured)
     assert name in causes
     for each, cause in causes.items():

@@ -15,7 +15,7 @@ from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import Estimate, StereoTracker
-from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, spoil
+from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, shift_image, spoil
 from tests.support.estimates import Demo, squared_error, track
 
 FRAMES = 40
@@ -130,6 +130,26 @@ def test_a_bump_is_said_when_it_happens_and_its_offset_is_learned(demo: Demo):
     change = after.disparity_offset - before.disparity_offset
     sigma = np.hypot(before.disparity_offset_sigma, after.disparity_offset_sigma)
     assert change == pytest.approx(-2.0, abs=float(4.0 * sigma))
+
+
+@pytest.mark.parametrize(("later", "change"), [(0.0, None), (-2.5, -2.5)])
+def test_rows_that_were_off_before_are_no_bump(demo: Demo, later: float, change: float | None):
+    """A frame that fails for another reason is asked for one."""
+    camera, frames, _ = demo
+    tracker = StereoTracker(camera)
+    moved = [replace(each, right=shift_image(each.right, 1.3, 0.0)) for each in frames[:13]]
+    track(tracker, moved[:12])
+    right = shift_image(moved[12].right, later, 0.0)
+    frame = Frame(*tracker.rectifier.rectify(moved[12].left, right), tracker._frontend)
+    tracker._motion.predict(moved[12].timestamp - moved[11].timestamp, np.full(2, 1.0), timestamp=moved[12].timestamp)
+    prediction = Prediction.of(tracker._window, tracker._motion)
+    views = [each.view for each in tracker._keyframes.active]
+    matches = tracker._localiser.guided.match_guided(frame.view, views, prediction.pose, prediction.covariance)
+    found = tracker._rig_watch.find_change(frame, matches, prediction)
+    assert (found is None) == (change is None)
+    if found is not None:
+        assert found.rows == pytest.approx(change, abs=0.3)
+        assert found.columns == pytest.approx(0.0, abs=0.3)
 
 
 def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Demo):
