@@ -33,6 +33,8 @@ _LEAST_PLACE, _LEAST_TURN = 2e-4, 2e-4
 # Gravity whose length is off by more than three sigmas and this was not found, m/s^2; nor was one whose direction is
 # less certain, radians.
 _LENGTH_TOLERANCE, _LEAST_TILT_CERTAINTY = 0.5, 0.05
+# Seconds of images without gravity after which it is said.
+_PATIENCE = 3.0
 # Turns of gyro and images that differ by more are not of one body: of the turns, and radians from frame to frame.
 _TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
 # rad/s: a gyro's bias is not known better at the start, whatever residuals say.
@@ -182,6 +184,7 @@ class GravitySearch:
     def __init__(self, sensor_sigma: np.ndarray) -> None:
         self.poses: list[tuple[float, np.ndarray]] = []
         self._sensor_sigma, self._is_refused = sensor_sigma, False
+        self._first: float | None = None
 
     def find(
         self, time: float, pose: np.ndarray, samples: InertialBuffer, T_camera_imu: np.ndarray, densities: np.ndarray
@@ -208,6 +211,7 @@ class GravitySearch:
             motions = [samples.preintegrate(*pair, np.r_[bias, np.zeros(3)], densities) for pair in pairwise(times)]
             whole = [each for each in motions if each is not None and each.missing == 0.0]
             if len(whole) < len(motions):
+                self._complain(time, "samples are missing; all up to an image are to come before it")
                 return None
             bias = bias + align_gyro(bodies, whole)[0]
         if not gyro_fits(bodies, whole):
@@ -220,6 +224,7 @@ class GravitySearch:
             return None
         found = align(poses, T_camera_imu, whole, self._sensor_sigma)
         if found is None:
+            self._complain(time, "forces do not fit the path, or it tells too little; are unit (m/s^2) and axes right?")
             return None
         way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
         _LOGGER.info(
@@ -227,3 +232,10 @@ class GravitySearch:
             *(np.degrees(_tilt(found.covariance)), time - times[0], way),
         )
         return replace(found, biases=np.r_[bias, np.zeros(3)] + found.biases)
+
+    def _complain(self, time: float, cause: str) -> None:
+        """Says once that gravity is still unknown, and why."""
+        self._first = time if self._first is None else self._first
+        if time - self._first > _PATIENCE:
+            _LOGGER.warning("the inertial sensor is not used yet, gravity is unknown after %g s: %s", _PATIENCE, cause)
+            self._first = np.inf

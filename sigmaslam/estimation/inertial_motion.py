@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_999
+from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
 from sigmaslam.estimation.gaussian import at_most, regression
 from sigmaslam.estimation.inertial_alignment import GravitySearch
@@ -30,8 +30,9 @@ SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 3, *[3.5e-3] * 3])
 2 ms, 5 mm and 0.2 degrees."""
 # Seconds in which clocks drift and mounts bend, as they warm up, by as much as they are off at first.
 _WARM_UP = 600.0
-# Seconds without samples after which the sensor is taken for dead.
-_DEAD = 1.0
+# Seconds without samples after which the sensor is taken for dead, and images in a row, of that much time at least,
+# that contradict it after which it is taken for wrong.
+_DEAD, _CONTRADICTIONS = 1.0, 8
 
 
 class InertialMotion(MotionFilter):
@@ -53,7 +54,7 @@ class InertialMotion(MotionFilter):
         super().__init__(backend)
         self._predict_inertial = load_step("inertial_predict", backend)
         self.samples, self.noise, self._T_camera_imu = InertialBuffer(sensor), LearnedNoise(), T_camera_imu
-        self._wheels = wheels
+        self._wheels, self._contradictions, self._mounting = wheels, 0, T_camera_imu
         self.sensors = {"imu": self.samples} | ({} if wheels is None else {"odometry": wheels.samples})
         self._velocity, self._gravity, self._biases = np.zeros(3), np.zeros(3), np.zeros(6)
         self._carried: np.ndarray | None = None
@@ -90,7 +91,9 @@ class InertialMotion(MotionFilter):
         self.samples.forget(start + self.samples.time_shift - WHILE)
         motion = self.samples.preintegrate(start, timestamp, self._biases, densities)
         if motion is None or motion.missing > _DEAD:
-            self._leave(seconds, densities)
+            _LOGGER.warning("the inertial sensor gives no samples: constant velocity goes on")
+            self._leave(np.sqrt(np.diag(self._covariance)[_VELOCITY]))
+            super().predict(seconds, densities)
             return
         step, velocity, covariance, carried = self._predict_inertial(
             {
@@ -147,6 +150,8 @@ class InertialMotion(MotionFilter):
             return
         P = self._covariance
         departure = se3_log(step @ se3_inverse(self.step))
+        is_excluded = squared_mahalanobis(departure, self.predicted_covariance) > CHI_SQUARE_9999_OF_6
+        self._contradictions = self._contradictions + 1 if is_excluded else 0
         # What images leave of the prediction; where they know less of the pose than it, they teach nothing.
         kept = at_most(covariance, P[_POSE, _POSE])
         removed = P[_POSE, _POSE] - kept
@@ -165,6 +170,12 @@ class InertialMotion(MotionFilter):
             if self._wheels is not None:
                 self._wheels.compare(self._time, self.twist, float(self._densities[0]))
         self._is_dark = False
+        if self._contradictions == _CONTRADICTIONS:
+            _LOGGER.warning("images contradict the inertial sensor: constant velocity until gravity is found anew")
+            self._leave(np.full(3, np.sqrt(self._densities[0])))
+            # As the sensor was described.
+            self.noise, self.samples.time_shift = LearnedNoise(), self.samples.sensor.time_shift
+            self._T_camera_imu = self._mounting
 
     def start_keyframe(self) -> None:
         """The current pose is the keyframe's from now on: velocity and gravity turn into its frame."""
@@ -232,15 +243,12 @@ class InertialMotion(MotionFilter):
             if squared_mahalanobis(residual, slope @ self._covariance @ slope.T + noise) < CHI_SQUARE_999[3]:
                 self._measure(residual, slope, noise)
 
-    def _leave(self, seconds: float, densities: np.ndarray) -> None:
-        """No samples come any more: constant velocity again, until gravity is found anew."""
-        _LOGGER.warning("the inertial sensor gives no samples: constant velocity goes on")
-        sigma = np.sqrt(np.r_[np.diag(self._covariance)[_VELOCITY], np.full(3, densities[1])])
+    def _leave(self, sigma: np.ndarray) -> None:
+        """Constant velocity again, known to (3,) m/s, until gravity is found anew."""
         pose = self.step_covariance.copy()
-        self.is_inertial, self._covariance = False, np.zeros((12, 12))
+        self.is_inertial, self._covariance, self._contradictions = False, np.zeros((12, 12)), 0
         self._covariance[_POSE, _POSE] = pose
-        self.set_twist(self.twist, sigma)
-        super().predict(seconds, densities)
+        self.set_twist(self.twist, np.r_[sigma, np.full(3, self._densities[1])])
 
     def _note_twist(self, rate: np.ndarray) -> None:
         """The camera's twist in its own frame, at that angular rate (3,)."""

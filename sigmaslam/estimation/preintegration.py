@@ -99,23 +99,26 @@ def preintegrate(
     unknown = np.column_stack([densities[1] * gaps**2 / 12.0, np.full(len(steps), densities[0])])
     spectra[is_missing] += unknown[is_missing]
     rates, forces = (0.5 * (values[1:] + values[:-1]) for values in (gyro, accel))
-    halves, crosses = rotation_exp(0.5 * steps[:, None] * rates), skew(forces)
-    turn, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
-    slope, noises, A, B = np.zeros((9, 6)), np.zeros((2, 9, 9)), np.eye(9), np.zeros((9, 6))
-    for h, half, force, cross, spectrum in zip(steps, halves, forces, crosses, spectra, strict=True):
-        middle = turn @ half
-        moved = middle @ force
-        A[TURN, TURN] = (half @ half).T
-        A[VELOCITY, TURN] = -h * middle @ cross @ half.T
-        A[POSITION, TURN] = 0.5 * h * A[VELOCITY, TURN]
-        A[POSITION, VELOCITY] = B[TURN, GYRO_BIAS] = h * np.eye(3)
-        B[VELOCITY, ACCEL_BIAS], B[POSITION, ACCEL_BIAS] = h * middle, 0.5 * h * h * middle
-        slope = A @ slope - B
-        parts = B.reshape(9, 2, 3).transpose(1, 0, 2)
-        noises = A @ noises @ A.T + (spectrum / h)[:, None, None] * parts @ parts.transpose(0, 2, 1)
-        position = position + h * velocity + 0.5 * h * h * moved
-        velocity = velocity + h * moved
-        turn = middle @ half
+    halves = rotation_exp(0.5 * steps[:, None] * rates)
+    rotations = np.empty((len(edges), 3, 3))
+    rotations[0] = np.eye(3)
+    for k, whole in enumerate(halves @ halves):
+        rotations[k + 1] = rotations[k] @ whole
+    turn, turned, h = rotations[-1], rotations[:-1] @ halves, steps[:, None]
+    moved = (turned @ forces[..., None])[..., 0]
+    speeds = np.vstack([np.zeros(3), np.cumsum(h * moved, axis=0)])
+    places = np.vstack([np.zeros(3), np.cumsum(h * speeds[:-1] + 0.5 * h * h * moved, axis=0)])
+    velocity, position, left = speeds[-1], places[-1], (end - edges[1:])[:, None]
+    # What an error of each step's rate and force makes of the end.
+    h, after, errors = h[..., None], rotations[1:], np.zeros((len(steps), 9, 6))
+    errors[:, TURN, GYRO_BIAS] = h * turn.T @ after
+    errors[:, VELOCITY, GYRO_BIAS] = -h * skew(velocity - speeds[1:]) @ after
+    errors[:, POSITION, GYRO_BIAS] = -h * skew(position - places[1:] - left * speeds[1:]) @ after
+    errors[:, VELOCITY, ACCEL_BIAS] = h * turned
+    errors[:, POSITION, ACCEL_BIAS] = (0.5 * h + left[..., None]) * h * turned
+    scaled = errors.reshape(-1, 9, 2, 3) * np.sqrt(spectra / steps[:, None])[:, None, :, None]
+    columns = scaled.transpose(2, 1, 0, 3).reshape(2, 9, -1)
+    slope, noises = -errors.sum(axis=0), columns @ columns.transpose(0, 2, 1)
     # The same samples, taken a moment later.
     delay = np.concatenate(
         [

@@ -34,7 +34,7 @@ class SampleBuffer:
                 _LOGGER.warning("a sample at %.6f s is not later than the last one: left out", timestamp)
             self.late += 1
             return
-        self._samples.append(np.r_[timestamp, turn, other])
+        self._samples.append(np.concatenate(([timestamp], turn, other)))
         self._table = None
         self.forget(timestamp - _KEPT)
 

@@ -260,3 +260,60 @@ def test_a_gyro_of_another_unit_or_axis_is_said_once_and_not_used(fault, caplog)
     assert not flight.filter.is_inertial
     assert caplog.text.count("are unit (rad/s), axes") == 1
     assert np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]) < 0.01
+
+
+def changed(samples: InertialSamples, since: float, until: float, fault) -> InertialSamples:
+    """Samples with a fault, which takes and gives times, rates and forces, between two times."""
+    on = (samples.timestamp >= since) & (samples.timestamp < until)
+    columns = [column.copy() for column in samples.columns()]
+    for column, values in zip(columns, fault(*(column[on] for column in columns)), strict=True):
+        column[on] = values
+    return InertialSamples(*columns)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fault",
+    [
+        lambda t, gyro, accel: (t + 0.1, gyro, accel),
+        lambda t, gyro, accel: (t, gyro[:, [1, 2, 0]], accel),
+        lambda t, gyro, accel: (t, gyro, accel / 9.81),
+        lambda t, gyro, accel: (t, gyro, accel[:, [1, 2, 0]]),
+        lambda t, gyro, accel: (t, 0.0 * gyro + gyro[0], 0.0 * accel + accel[0]),
+    ],
+    ids=["clock", "axes of the gyro", "unit of the force", "axes of the force", "stuck"],
+)
+def test_a_sensor_that_turns_wrong_is_said_and_left_within_a_second(fault, caplog):
+    flight = Flight(5, wrong=True)
+    flight.samples = changed(flight.samples, 2.5, 9.0, fault)
+    flight.fly(70)
+    assert not flight.filter.is_inertial
+    assert caplog.text.count("images contradict the inertial sensor") == 1
+    # By the sensor a dark second would end 0.8 to 13 m off at a sigma of 0.1 m.
+    flight.fly(20, dark=True)
+    error = se3_log(flight.truth @ se3_inverse(flight.filter.step))
+    assert error @ np.linalg.solve(flight.filter.step_covariance, error) / 6 < 20.0
+
+
+@pytest.mark.long
+def test_a_sensor_that_is_wrong_for_a_moment_is_used_again():
+    flight = Flight(5)
+    flight.samples = changed(flight.samples, 2.0, 3.0, lambda t, gyro, accel: (t, -gyro, accel))
+    flight.fly(52)
+    assert not flight.filter.is_inertial
+    flight.fly(38)
+    assert flight.filter.is_inertial
+    flight.fly(20, dark=True)
+    assert np.linalg.norm((flight.truth - flight.filter.step)[:3, 3]) < 0.1
+    assert flight.nees()["pose"] < 3.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("unit", "late", "cause"), [(9.81, 0.0, "are unit (m/s^2)"), (1.0, 0.2, "are missing")])
+def test_a_sensor_that_cannot_be_used_is_said_once(unit, late, cause, caplog):
+    flight = Flight(5)
+    t, gyro, accel = flight.samples.columns()
+    flight.samples, flight.filter.samples.time_shift = InertialSamples(t + late, gyro, accel / unit), late
+    flight.fly(100)
+    assert not flight.filter.is_inertial
+    assert caplog.text.count("not used yet") == caplog.text.count(cause) == 1
