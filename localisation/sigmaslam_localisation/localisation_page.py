@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +14,7 @@ from markupsafe import Markup
 
 from sigmaslam.files import atomic_write_text, printable
 from sigmaslam.plot_style import BLUE, GREEN, GREY, NO_MATPLOTLIB, SERIES, has_matplotlib, style_axes
-from sigmaslam.report.figures import save_png, to_svg
+from sigmaslam.report.figures import save_png
 from sigmaslam_localisation.robots import RobotEstimate
 
 if TYPE_CHECKING:
@@ -50,7 +52,7 @@ def write_page(
         ],
         remark=None if has_matplotlib() else NO_MATPLOTLIB,
         figures=[
-            (title, caption, Markup(to_svg(figure, f"figure{number}")))
+            (title, caption, Markup(_to_svg(figure, f"figure{number}")))
             for number, (title, caption, figure) in enumerate(figures)
         ],
     )
@@ -133,3 +135,24 @@ def _cell(value: Any) -> str:
     if value is None:
         return "–"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _to_svg(figure: Figure, name: str) -> str:
+    """The figure as an `<svg>` element to put into a page; the same figure gives the same text.
+
+    Args:
+        figure: what to draw; rasterised artists become a PNG inside.
+        name: unique among the figures of one page, as it makes their identifiers unique.
+    """
+    import matplotlib
+
+    target = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(target, format="svg", dpi=100, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    text = target.getvalue()
+    text = text[text.index("<svg") :]
+    # Matplotlib writes six digits; a screen does not resolve a hundredth of a point.
+    text = re.sub(r' (?:d|x|y)="[^"]*"', lambda attribute: re.sub(r"(\.\d\d)\d+", r"\1", attribute[0]), text)
+    # Matplotlib repeats the names of groups in each figure. Only groups with references need one.
+    used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', text))
+    return re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", text)

@@ -39,7 +39,7 @@ Detector = Callable[[np.ndarray], Features]
 
 
 @dataclass(frozen=True, slots=True)
-class RefinedMatches:
+class RefinedMatches(Table):
     """One-to-one matches of two images, refined.
 
     Attributes:
@@ -54,12 +54,6 @@ class RefinedMatches:
     places: np.ndarray
     probability: np.ndarray
     covariance: np.ndarray
-
-    def select(self, index: np.ndarray) -> RefinedMatches:
-        """The matches of that index or mask."""
-        return RefinedMatches(
-            self.index0[index], self.index1[index], self.places[index], self.probability[index], self.covariance[index]
-        )
 
 
 Refine = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Refinement]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -25,6 +25,7 @@ from sigmaslam.frontend.rival_matches import count_rivals, share_with_rivals
 from sigmaslam.frontend.types import Features
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.readers.images import check_grey, read_grey
+from sigmaslam.table import Table
 
 DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}
 # Matches with a smaller probability are dropped by default.
@@ -47,7 +48,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Matches:
+class Matches(Table):
     """Correspondences between two images, one to one, the most probable first.
 
     Attributes:
@@ -67,15 +68,9 @@ class Matches:
     index0: np.ndarray
     index1: np.ndarray
 
-    def select(self, index: np.ndarray) -> Matches:
-        """The matches of that index or mask."""
-        return Matches(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    def joined(self, other: Matches) -> Matches:
-        """These and the others, the most probable first."""
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        both = Matches(*(np.concatenate(pair) for pair in pairs))
-        return both.select(np.argsort(-both.probability, kind="stable"))
+    def by_probability(self) -> Matches:
+        """The same, the most probable first."""
+        return self.select(np.argsort(-self.probability, kind="stable"))
 
 
 def match_images(
@@ -161,7 +156,7 @@ def match_twice(
     second = _refined(estimator, image0, image1, features0, features1, putative)
     # Improbable matches stay where nothing took their keypoints.
     free = ~probable & ~np.isin(first.index0, second.index0) & ~np.isin(first.index1, second.index1)
-    matches = second.joined(first.select(free))
+    matches = Matches.concatenate([second, first.select(free)]).by_probability()
     return matches.select(matches.probability >= min_probability)
 
 
@@ -199,8 +194,7 @@ def _match_and_doubt(
         if others > count:
             probability = matches.probability * np.float32(count / (count + others))
             _LOGGER.warning("upside down, image 1 has %d matches and not %d: turn it by 180 degrees", others, count)
-    matches = replace(matches, probability=probability)
-    matches = matches.select(np.argsort(-probability, kind="stable"))
+    matches = replace(matches, probability=probability).by_probability()
     return matches.select(matches.probability >= min_probability)
 
 
@@ -224,7 +218,7 @@ def _refined(
     )
     keypoints, places = features0.keypoints[matches.index0], matches.places.astype(np.float32)
     columns = keypoints, places, matches.probability, matches.covariance, matches.index0, matches.index1
-    return Matches(*columns).select(np.argsort(-matches.probability, kind="stable"))
+    return Matches(*columns).by_probability()
 
 
 def match_files(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_99_OF_2
+from sigmaslam.table import Table
 
 # A missing neighbour has this similarity, the smallest that two unit vectors can have.
 _NO_SIMILARITY = -1.0
@@ -15,7 +16,7 @@ _DENSE_FROM = 1 / 8
 
 
 @dataclass(frozen=True, slots=True)
-class Putative:
+class Putative(Table):
     """Putative matches: keypoints of image 0 with their nearest neighbours in image 1, right or wrong.
 
     Attributes:
@@ -41,12 +42,6 @@ class Putative:
         # The margin keeps two identical candidates, both at distance zero, from passing as distinct.
         return np.asarray((1.0 - self.similarity) + 1e-6 <= ratio * ratio * (1.0 - self.second0))
 
-    def select(self, index: np.ndarray) -> Putative:
-        """The matches of that index or mask."""
-        return Putative(
-            self.index0[index], self.index1[index], self.similarity[index], self.second0[index], self.second1[index]
-        )
-
 
 def nearest_anywhere(descriptors0: np.ndarray, descriptors1: np.ndarray) -> Putative:
     """Nearest neighbours among all keypoints of two images with descriptors (N, D), (M, D) of unit length."""
@@ -65,28 +60,6 @@ def nearest_anywhere(descriptors0: np.ndarray, descriptors1: np.ndarray) -> Puta
     return Putative(rows, index1, best1, second, other)
 
 
-def nearest_in_rows(
-    left: np.ndarray,
-    right: np.ndarray,
-    descriptors_left: np.ndarray,
-    descriptors_right: np.ndarray,
-    row_tolerance: float,
-    disparity_range: tuple[float, float],
-) -> Putative:
-    """Nearest neighbours along the rows of a rectified pair.
-
-    Args:
-        left, right: (N, 2), (M, 2) keypoints.
-        descriptors_left, descriptors_right: (N, D), (M, D) of unit length.
-        row_tolerance: largest |v_left - v_right|, pixels.
-        disparity_range: allowed u_left - u_right, pixels.
-    """
-    first, second = _pairs_in_band(left[:, 1], np.full(len(left), row_tolerance), right[:, 1])
-    disparity = left[first, 0] - right[second, 0]
-    allowed = (disparity >= disparity_range[0]) & (disparity <= disparity_range[1])
-    return nearest_among_pairs(descriptors_left, descriptors_right, first[allowed], second[allowed])
-
-
 def nearest_in_ellipses(
     predicted: np.ndarray,
     covariance: np.ndarray,
@@ -103,7 +76,7 @@ def nearest_in_ellipses(
         descriptors0, descriptors1: (N, D), (M, D) of unit length.
     """
     half_height = np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 1, 1])
-    first, second = _pairs_in_band(predicted[:, 1], half_height, keypoints[:, 1])
+    first, second = pairs_in_band(predicted[:, 1], half_height, keypoints[:, 1])
     offset = keypoints[second] - predicted[first]
     # The bounding box of the ellipse goes first: most pairs of a band are far outside.
     close = np.abs(offset[:, 0]) <= np.sqrt(CHI_SQUARE_99_OF_2 * covariance[:, 0, 0])[first]
@@ -143,7 +116,7 @@ def within_ellipses(offset: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.asarray(vv * u * u - 2.0 * uv * u * v + uu * v * v <= CHI_SQUARE_99_OF_2 * (uu * vv - uv * uv))
 
 
-def _pairs_in_band(row0: np.ndarray, tolerance: np.ndarray, row1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pairs_in_band(row0: np.ndarray, tolerance: np.ndarray, row1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Index pairs (K,), (K,) with |row1 - row0| <= tolerance (N,), in order of the first."""
     order = np.argsort(row1, kind="stable")
     rows = row1[order]

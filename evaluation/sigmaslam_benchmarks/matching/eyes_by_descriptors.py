@@ -4,10 +4,10 @@ import numpy as np
 
 from sigmaslam.frontend.descriptor import LEAST_PROBABILITY, RefinedMatches, refine_with_confidence
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
-from sigmaslam.frontend.nearest_neighbours import nearest_in_rows
 from sigmaslam.frontend.plane_alignment import refine_in_rows
 from sigmaslam.frontend.row_search import MAX_DISPARITY, ROW_TOLERANCE
 from sigmaslam.frontend.types import Features
+from sigmaslam_training.matching.match_sets import nearest_in_rows
 
 # A little below zero, so that points at infinity survive a disparity offset.
 _LEAST_DISPARITY = -2.0

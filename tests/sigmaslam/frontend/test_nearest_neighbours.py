@@ -11,11 +11,12 @@ from sigmaslam.frontend import FRONTENDS, Frontend, StereoView, build_frontend
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.lucas_kanade import lucas_kanade, refine
-from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
+from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses
 from sigmaslam.frontend.types import KeypointSearch
 from sigmaslam.inference import onnx_graph as session
 from sigmaslam.readers import open_sequence
 from sigmaslam_synthetic.simulation import Simulation, Studio
+from sigmaslam_training.matching.match_sets import nearest_in_rows
 
 # Of two degrees of freedom, whose distribution is exponential.
 CHI_SQUARE_99 = -2.0 * np.log(0.01)

@@ -16,11 +16,11 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum, write_kitti
-from sigmaslam.report.figures import plot_trajectory
 from sigmaslam.run_record.frame_table import STATUSES, TRACKED, predicted_poses, read_frames
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
 from sigmaslam.run_record.run_failure import explain_failure
 from sigmaslam_benchmarks.trial import read_trial
+from sigmaslam_evaluation.evaluation_figure import plot_trajectory
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.demo_parts import copy_frames

@@ -13,7 +13,13 @@ from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import atomic_path, make_folder
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import LearnedDetector
-from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, nearest_in_rows
+from sigmaslam.frontend.nearest_neighbours import (
+    Putative,
+    nearest_among_pairs,
+    nearest_anywhere,
+    nearest_in_ellipses,
+    pairs_in_band,
+)
 from sigmaslam.frontend.types import Features
 from sigmaslam_synthetic.homography_pairs import HomographyPairs
 from sigmaslam_synthetic.rendering.textures import KINDS
@@ -110,6 +116,28 @@ class MatchSets:
             if len(putative.index0) >= _MIN_MATCHES:
                 sets[kind] = MatchSet(source, _bare(features0), _bare(features1), putative, places, visible)
         return PairRecord(image0, image1, sets)
+
+
+def nearest_in_rows(
+    left: np.ndarray,
+    right: np.ndarray,
+    descriptors_left: np.ndarray,
+    descriptors_right: np.ndarray,
+    row_tolerance: float,
+    disparity_range: tuple[float, float],
+) -> Putative:
+    """Nearest neighbours along the rows of a rectified pair.
+
+    Args:
+        left, right: (N, 2), (M, 2) keypoints.
+        descriptors_left, descriptors_right: (N, D), (M, D) of unit length.
+        row_tolerance: largest |v_left - v_right|, pixels.
+        disparity_range: allowed u_left - u_right, pixels.
+    """
+    first, second = pairs_in_band(left[:, 1], np.full(len(left), row_tolerance), right[:, 1])
+    disparity = left[first, 0] - right[second, 0]
+    allowed = (disparity >= disparity_range[0]) & (disparity <= disparity_range[1])
+    return nearest_among_pairs(descriptors_left, descriptors_right, first[allowed], second[allowed])
 
 
 def _match(
