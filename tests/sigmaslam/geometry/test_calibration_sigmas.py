@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -53,6 +54,12 @@ def test_zero_is_a_calibration_without_errors(tmp_path: Path, zero: Any):
 def test_what_is_named_is_set_and_the_rest_as_by_default(tmp_path: Path):
     expected = replace(CalibrationSigmas(), focal=0.01, rotation=1e-4, baseline=0.0)
     assert read(written(tmp_path, {"focal": 0.01, "rotation": "1e-4", "baseline": 0})) == expected
+
+
+def test_a_way_that_is_a_per_cent_too_long_is_within_three_sigmas():
+    """No image shows a baseline that is wrong: only its sigma can tell."""
+    default = CalibrationSigmas()
+    assert 0.01 <= 3.0 * np.hypot(default.baseline, default.focal) <= 0.02
 
 
 def test_sigmas_survive_a_file(tmp_path: Path):
