@@ -258,20 +258,6 @@ py::list window_gate(const py::dict& given) {
     return results;
 }
 
-py::list pose_predict(const py::dict& given) {
-    Feed feed(given);
-    double in[plain::pose_common_inputs], shared[plain::pose_shared], out[plain::pose_outputs];
-    double* to = in;
-    const std::pair<const char*, int> inputs[] = {{"pose", 16}, {"twist", 6}, {"covariance", 144}, {"step", 1}, {"densities", 2}};
-    for (const auto& [name, size] : inputs) to = std::copy_n(feed.numbers(name), size, to);
-    plain::pose_common(in, shared);
-    plain::pose_item<double>(shared, nullptr, out);
-    py::list results;
-    results.append(array(std::vector<double>(out, out + 16), {4, 4}));
-    results.append(array(std::vector<double>(out + 16, out + 160), {12, 12}));
-    return results;
-}
-
 }  // namespace
 
 PYBIND11_MODULE(_estimator, module) {
@@ -287,5 +273,4 @@ PYBIND11_MODULE(_estimator, module) {
     module.def("frame_gated", &frame_gated);
     module.def("window_eliminate", &window_eliminate);
     module.def("window_gate", &window_gate);
-    module.def("pose_predict", &pose_predict);
 }

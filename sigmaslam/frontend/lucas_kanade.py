@@ -26,9 +26,15 @@ def lucas_kanade(
     """
     if len(points0) == 0:
         return np.zeros((0, 2)), np.zeros(0, bool)
-    start, guess = (np.array(each, np.float32).reshape(-1, 1, 2) for each in (points0, guess1))
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        image0, image1, start, guess, None, None, (window, window), levels, _CRITERIA, cv2.OPTFLOW_USE_INITIAL_FLOW
+        image0,
+        image1,
+        np.ascontiguousarray(points0, np.float32).reshape(-1, 1, 2),
+        np.ascontiguousarray(guess1, np.float32).reshape(-1, 1, 2).copy(),
+        winSize=(window, window),
+        maxLevel=levels,
+        criteria=_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     height, width = image1.shape
     places = found.reshape(-1, 2).astype(np.float64)

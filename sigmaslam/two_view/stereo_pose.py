@@ -140,9 +140,15 @@ def _from_points(
     camera: RectifiedStereo, points: np.ndarray, pixels: np.ndarray, threshold: float
 ) -> tuple[np.ndarray | None, float]:
     """T_camera_key from P3P in RANSAC, and the share of the points that agree."""
-    # At most 500 times, until the best is found with a probability of 0.9999.
     succeeded, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, pixels, camera.matrix, None, None, None, False, 500, threshold, 0.9999, None, cv2.SOLVEPNP_AP3P
+        points,
+        pixels,
+        camera.matrix,
+        None,
+        flags=cv2.SOLVEPNP_AP3P,
+        iterationsCount=500,
+        reprojectionError=threshold,
+        confidence=0.9999,
     )
     return (_pose(rotation, translation), len(inliers) / len(points)) if succeeded else (None, 0.0)
 

@@ -66,8 +66,8 @@ _WEIGHT_CASES = [
         (
             "100 bytes changed in the filter",
             # Of the others none is opened where they are compiled.
-            partial(_flip, "window_condition.onnx"),
-            "window_condition.onnx",
+            partial(_flip, "pose_predict.onnx"),
+            "pose_predict.onnx",
             "SHA-256",
             None,
         ),

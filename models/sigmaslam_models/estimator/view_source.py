@@ -1,4 +1,4 @@
-"""What the graphs do for a view, and the prediction, as C++ from the same modules: `sigmaslam/estimation/views.inc`.
+"""What the estimator's graphs do for each view, as C++ from the same modules: `sigmaslam/estimation/views.inc`.
 
 A view is traced with two poses alone, those that its landmark is anchored to and that see it, so the state has 27
 numbers: of the calibration and of both poses. `estimator.cpp` puts them where they belong in the whole state.
@@ -14,7 +14,6 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE
 from sigmaslam_filters.compiler.item_source import write_functions
 from sigmaslam_models.estimator.frame_update import NOISE_SCALE_RULES, ROBUST_SCALES, FrameViews, linearised, predicted
-from sigmaslam_models.estimator.pose_prediction import STATE_SIZE, Predict
 from sigmaslam_models.estimator.window_solution import WindowViews, agreeing, whitened
 
 SIZE = CALIBRATION_SIZE + 12
@@ -38,7 +37,6 @@ def write_views() -> str:
             write_functions("predict", _predicted_view, _numbers(_FRAME), _numbers(_OWN)),
             write_functions("frame", _linearised_view, _numbers(_FRAME), _numbers((*_OWN, "moved", *_SEEN))),
             write_functions("window", _window_view, _numbers((*_WINDOW, "freedom")), _numbers((*_OWN, *_SEEN))),
-            write_functions("pose", Predict(), _numbers(_POSE), {}),
         ]
     )
 
@@ -47,13 +45,11 @@ _WINDOW = ("intrinsics", "depth", "unscented", "poses", "calibration", "spread")
 _FRAME = (*_WINDOW, "offset")
 _OWN = ("estimate", "covariance", "common")
 _SEEN = ("measurement", "noise")
-_POSE = ("pose", "twist", "pose_covariance", "step", "densities")
 _SHAPES: dict[str, tuple[int, ...]] = {
     **{"intrinsics": (5,), "depth": (), "unscented": (), "freedom": (), "poses": (2, 4, 4)},
     **{"calibration": (CALIBRATION_SIZE,), "spread": (SIZE, SIZE), "offset": (SIZE,), "common": (3, 2)},
     **{"estimate": (LANDMARK_SIZE,), "covariance": (LANDMARK_SIZE, LANDMARK_SIZE), "moved": (LANDMARK_SIZE,)},
-    **{"measurement": (3,), "noise": (3, 3), "pose": (4, 4), "twist": (6,), "step": (), "densities": (2,)},
-    "pose_covariance": (STATE_SIZE, STATE_SIZE),
+    **{"measurement": (3,), "noise": (3, 3)},
 }
 
 

@@ -10,14 +10,12 @@ import sigmaslam.estimation
 from sigmaslam.estimation import estimator_graphs
 from sigmaslam.estimation.estimator_graphs import open_step
 from sigmaslam.inference.backends import load_step
-from sigmaslam_models.estimator.estimator_export import _predict_example
 from sigmaslam_models.estimator.estimator_export import estimator_graphs as traced_modules
 from sigmaslam_models.estimator.graph_examples import frame_example, window_example
 from sigmaslam_models.estimator.view_source import write_views
 
 FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
 WINDOW_STEPS = ("window_eliminate", "window_gate")
-STEPS = (*FRAME_STEPS, *WINDOW_STEPS, "pose_predict")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,11 +29,7 @@ def inputs():
 
 
 def feeds(name, inputs):
-    """Few and many views, one pair of poses and a full window; or a motion, uncertain or known."""
-    if name == "pose_predict":
-        values = {key: value.numpy() for key, value in zip(inputs[name], _predict_example(5), strict=True)}
-        yield from (values | {"covariance": scale * values["covariance"]} for scale in (1.0, 0.0))
-        return
+    """Few and many views, one pair of poses and a full window."""
     example, sizes = (
         (frame_example, ((1, 2), (6, 211), (7, 40))) if name in FRAME_STEPS else (window_example, ((2, 3), (7, 120)))
     )
@@ -44,7 +38,7 @@ def feeds(name, inputs):
         yield {key: value.numpy() for key, value in zip(inputs[name], values, strict=True)}
 
 
-@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize("name", [*FRAME_STEPS, *WINDOW_STEPS])
 @pytest.mark.parametrize(
     ("unscented", "tolerance"),
     # Derivatives are differences over a spread of 1e-6, which is what rounding is multiplied by.
@@ -52,8 +46,7 @@ def feeds(name, inputs):
 )
 def test_compiled_step_equals_torch(name, unscented, tolerance, inputs):
     for feed in feeds(name, inputs):
-        if name != "pose_predict":
-            feed["unscented"] = np.array(unscented)
+        feed["unscented"] = np.array(unscented)
         found, expected = open_step(name)(feed), open_step(name, "torch")(feed)
         assert len(found) == len(expected)
         for a, b in zip(found, expected, strict=True):
@@ -61,7 +54,7 @@ def test_compiled_step_equals_torch(name, unscented, tolerance, inputs):
             np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * max(1.0, float(np.abs(b).max())))
 
 
-@pytest.mark.parametrize("name", STEPS)
+@pytest.mark.parametrize("name", [*FRAME_STEPS, *WINDOW_STEPS])
 def test_compiled_step_repeats_to_the_bit(name, inputs):
     feed = next(feeds(name, inputs))
     for a, b in zip(open_step(name)(feed), open_step(name)(feed), strict=True):
