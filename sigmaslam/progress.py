@@ -22,13 +22,7 @@ def open_progress(hidden: bool = False, console: Console | None = None, line_eve
         line_every: seconds between lines, where the console is a file or a pipe.
     """
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     class LineProgress(Progress):
         """A bar that says a line now and then where it cannot be drawn."""

@@ -8,14 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sigmaslam_filters import (
-    Diagonal,
-    Gaussian,
-    MeasurementModel,
-    MotionModel,
-    ParticleFilter,
-    UnscentedKalmanFilter,
-)
+from sigmaslam_filters import Diagonal, Gaussian, MeasurementModel, MotionModel, ParticleFilter, UnscentedKalmanFilter
 
 DOUBLE, RUNS, STEPS = torch.float64, 100, 50
 

@@ -17,15 +17,7 @@ from sigmaslam_filters.checks import (
     check_update,
 )
 from sigmaslam_filters.core.columns import Columns, noise_entering, predicted_covariance, predicted_factor
-from sigmaslam_filters.core.factors import (
-    both,
-    finite,
-    may_look,
-    multiply,
-    nonnegative,
-    square,
-    triangularise,
-)
+from sigmaslam_filters.core.factors import both, finite, may_look, multiply, nonnegative, square, triangularise
 from sigmaslam_filters.core.failure import POLICIES, OnFailure, Suspects, jittered, raise_unless_healthy
 from sigmaslam_filters.core.noise_covariance import Noise, as_noise
 from sigmaslam_filters.core.plain_factors import PIVOT_TOLERANCES

@@ -13,11 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from sigmaslam_filters.core.factors import (
-    identity,
-    solve_lower,
-    triangularise,
-)
+from sigmaslam_filters.core.factors import identity, solve_lower, triangularise
 from sigmaslam_filters.core.failure import FilterError, name_elements
 from sigmaslam_filters.core.noise_covariance import Dense, Rooted, as_noise
 from sigmaslam_filters.core.tensors import shapes_of

@@ -19,12 +19,7 @@ from sigmaslam.calibration.calibration_report import (
 )
 from sigmaslam.calibration.image_bootstrap import RESAMPLES, bootstrap_rigs, widened
 from sigmaslam.calibration.imu_calibration import MAX_ROUNDS, calibrate_imu
-from sigmaslam.calibration.imu_report import (
-    board_path,
-    describe_imu_calibration,
-    image_times,
-    write_imu_calibration,
-)
+from sigmaslam.calibration.imu_report import board_path, describe_imu_calibration, image_times, write_imu_calibration
 from sigmaslam.calibration.lens_choice import calibrate_whole_images
 from sigmaslam.cli.extras import need_report_extra
 from sigmaslam.errors import InputError

@@ -10,20 +10,10 @@ import numpy as np
 from sigmaslam.frontend.followed_patches import PatchTargets, correct_by_neighbours, find_patches, shrink
 from sigmaslam.frontend.lucas_kanade import refine
 from sigmaslam.frontend.match_confidence import MIN_LOGIT, ConfidenceEstimator
-from sigmaslam.frontend.nearest_neighbours import (
-    Putative,
-    nearest_anywhere,
-    nearest_in_ellipses,
-    within_ellipses,
-)
+from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere, nearest_in_ellipses, within_ellipses
 from sigmaslam.frontend.patch_evidence import Evidence, examine_patches
 from sigmaslam.frontend.plane_alignment import refine_on_planes
-from sigmaslam.frontend.row_search import (
-    REACH_PREDICTED,
-    REACH_SEARCHED,
-    align_in_rows,
-    search_rows,
-)
+from sigmaslam.frontend.row_search import REACH_PREDICTED, REACH_SEARCHED, align_in_rows, search_rows
 from sigmaslam.frontend.types import Features, KeypointSearch, PatchMaps, Refinement, StereoView, TemporalMatches
 from sigmaslam.frontend.verifier_inputs import PlaceSearch
 from sigmaslam.table import Table

@@ -25,12 +25,7 @@ from sigmaslam.readers.trajectory_files import read_covariances
 from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
 from sigmaslam.run_record.recorded_run import read_final_trajectory
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
-from sigmaslam.run_record.run_folder import (
-    FINAL_COVARIANCE,
-    RUN_NAME,
-    camera_of,
-    check_has_trajectory,
-)
+from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, RUN_NAME, camera_of, check_has_trajectory
 
 MOST_FRAMES = 5
 """From one view to the next, at the most."""

@@ -9,13 +9,7 @@ import torch
 
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam_benchmarks.tracking.consistency import depths_around
-from sigmaslam_benchmarks.tracking.consistency_page import (
-    DRAWN,
-    ConsistencyResult,
-    Scale,
-    format_noise,
-    format_page,
-)
+from sigmaslam_benchmarks.tracking.consistency_page import DRAWN, ConsistencyResult, Scale, format_noise, format_page
 from sigmaslam_evaluation.metrics.map_consistency import (
     coverage,
     depth_edges,

@@ -18,13 +18,7 @@ from sigmaslam_benchmarks.tracking.runtime import time_everything, write_runtime
 from sigmaslam_benchmarks.tracking.runtime_page import SEQUENCE, SIZE, TimedRun, format_runtime
 from sigmaslam_benchmarks.tracking.sequences_page import Omission
 from sigmaslam_benchmarks.tracking.stereo_peers import CuvslamPeer, MissingPeerError, OrbSlamPeer, orb_settings
-from sigmaslam_benchmarks.tracking.time_method import (
-    METHODS,
-    FailedMethodError,
-    MethodTiming,
-    TimingJob,
-    time_method,
-)
+from sigmaslam_benchmarks.tracking.time_method import METHODS, FailedMethodError, MethodTiming, TimingJob, time_method
 from tests.support.commands import run_here
 
 FRAMES = 6

@@ -8,14 +8,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from sigmaslam_models.detector import (
-    BORDER,
-    CELL,
-    detect,
-    hessian_response,
-    to_cells,
-    to_half_cells,
-)
+from sigmaslam_models.detector import BORDER, CELL, detect, hessian_response, to_cells, to_half_cells
 from sigmaslam_synthetic.rendering.textures import dead_leaves
 
 SIGMA = 1.4

@@ -19,13 +19,7 @@ from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered
-from sigmaslam_benchmarks.tracking.consistency_page import (
-    DRAWN,
-    ConsistencyResult,
-    Scale,
-    format_noise,
-    format_page,
-)
+from sigmaslam_benchmarks.tracking.consistency_page import DRAWN, ConsistencyResult, Scale, format_noise, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Trial, track_ours
 from sigmaslam_evaluation.metrics import map_consistency as consistency

@@ -20,16 +20,7 @@ from sigmaslam.readers.trajectory_files import read_kitti, write_kitti
 from sigmaslam_evaluation.evaluation_result import Evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.quantiles import WITHIN_3_SIGMA
-from tests.support.simulated_body import (
-    RADIUS,
-    WALL,
-    SimulatedBody,
-    box_around,
-    errors_of,
-    follow,
-    nees_of,
-    wandering,
-)
+from tests.support.simulated_body import RADIUS, WALL, SimulatedBody, box_around, errors_of, follow, nees_of, wandering
 from tests.support.simulated_location import sense
 from tests.support.tracked import track
 

@@ -13,15 +13,7 @@ from sigmaslam.calibration.calibrate import BoardCalibration, calibrate, rig_cov
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
-from tests.support.simulated_board import (
-    CHESSBOARD,
-    FISHEYE,
-    RADTAN,
-    board_poses,
-    seen_corners,
-    stereo_rig,
-    views_of,
-)
+from tests.support.simulated_board import CHESSBOARD, FISHEYE, RADTAN, board_poses, seen_corners, stereo_rig, views_of
 
 SIZE = (640, 480)
 

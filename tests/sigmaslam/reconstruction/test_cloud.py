@@ -6,14 +6,7 @@ import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, transform_points
-from sigmaslam.reconstruction.cloud import (
-    DenseCloud,
-    DepthPixels,
-    VoxelCloud,
-    inverse,
-    largest_eigenvalue,
-    write_cloud,
-)
+from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, inverse, largest_eigenvalue, write_cloud
 
 # Places of the six numbers of a symmetric matrix.
 SIX = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]

@@ -5,12 +5,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.reconstruction import disparity
-from sigmaslam.reconstruction.disparity import (
-    align_disparity,
-    measure_disparity,
-    row_offset,
-    semi_global_disparity,
-)
+from sigmaslam.reconstruction.disparity import align_disparity, measure_disparity, row_offset, semi_global_disparity
 from tests.support.textured_pairs import textured_pair
 
 HEIGHT, WIDTH = 120, 200
