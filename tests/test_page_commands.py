@@ -1,4 +1,4 @@
-"""Commands and options on the pages are those of the command line; the scripts and targets that they name exist.
+"""Commands and options on the pages, and in tables beside them, are the command line's; scripts and targets exist.
 
 The notebook, the changes and pages of benchmarks are history: their commands are those of their day.
 `tests/release/test_pages.py` runs commands as they stand.
@@ -81,7 +81,8 @@ def options() -> set[str]:
 
 
 BLOCKS = [(page, command) for page in PAGES for command in commands(parts(page)[0])]
-MENTIONS = [(page, command) for page in PAGES for command in commands(parts(page)[1])]
+TABLES = sorted((ROOT / "docs").glob("*.csv"))
+MENTIONS = [(page, command) for page in (*PAGES, *TABLES) for command in commands(parts(page)[1])]
 
 
 @pytest.mark.parametrize(("page", "command"), BLOCKS, ids=lambda each: getattr(each, "name", each))
@@ -101,7 +102,7 @@ def test_a_command_in_a_sentence_has_only_names_that_exist(page: Path, command: 
             pytest.fail(message)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *TABLES], ids=lambda page: page.name)
 def test_every_option_on_a_page_exists(page: Path):
     lines, spans = parts(page)
     named = {option for text in lines + spans for option in OPTION.findall(text)}

@@ -1,11 +1,12 @@
-"""The filters' gallery: runs each example, draws it, and prints lines, processor seconds and results as a table.
+"""The filters' gallery: runs each example, draws it, and prints lines, processor seconds and results as CSV.
 
-`python examples/filters/gallery.py docs/images/filters MRCLAM_Dataset6` makes the gallery of docs/filters.md;
-without the second folder the robots are left out.
+`python examples/filters/gallery.py docs/images/filters MRCLAM_Dataset6 > docs/filters.gallery.csv` makes the gallery of
+docs/filters.md; without the second folder the robots are left out.
 """
 
 from __future__ import annotations
 
+import csv
 import importlib
 import sys
 import tempfile
@@ -104,7 +105,8 @@ def main(pictures: Path, robots: Path | None) -> None:
     if robots is not None:
         rows.append(("Robot among landmarks", "localise_robot", robot_among_landmarks(robots)))
     pictures.mkdir(parents=True, exist_ok=True)
-    print("| example | lines | CPU [s] | result |\n|---|---|---|---|")
+    table = csv.writer(sys.stdout, lineterminator="\n")
+    table.writerow(["example", "lines", "CPU [s]", "result"])
     for title, name, run in rows:
         figure = Figure(figsize=(5.6, 2.4), layout="constrained")
         axes = figure.add_subplot()
@@ -113,9 +115,7 @@ def main(pictures: Path, robots: Path | None) -> None:
         seconds = time.process_time() - begun
         figure.savefig(pictures / f"{name}.png", dpi=80)
         lines = len((Path(__file__).parent / f"{name}.py").read_text().splitlines())
-        print(
-            f"| {title} | {lines} | {seconds:.1f} | {', '.join(f'{k} {v:.3g}' for k, v in found.items())} |", flush=True
-        )
+        table.writerow([title, lines, f"{seconds:.1f}", ", ".join(f"{k} {v:.3g}" for k, v in found.items())])
 
 
 if __name__ == "__main__":
