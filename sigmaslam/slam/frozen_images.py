@@ -43,8 +43,10 @@ class LastPairs:
             left, right: (H, W) uint8.
         """
         pair = _Probed(left), _Probed(right)
-        panels = [_rows_in_all(one, [other[eye] for other in self._pairs]) for eye, one in enumerate(pair)]
-        same = [any(map(_shows, pair, other, panels)) for other in self._pairs]
+        same, known = [False] * len(self._pairs), {row for other in self._pairs for eye in other for row in eye.rows}
+        if not known.isdisjoint(pair[0].rows + pair[1].rows):  # else no row is an old one
+            panels = [_rows_in_all(one, [other[eye] for other in self._pairs]) for eye, one in enumerate(pair)]
+            same = [any(map(_shows, pair, other, panels)) for other in self._pairs]
         self._pairs.append(pair)
         is_last, is_old = bool(same and same[-1]), any(same[:-1])
         is_repeated = is_last or (is_old and not self._was_old)
