@@ -91,11 +91,12 @@ class FrameClock:
         Returns:
             The time between the two frames, and its standard deviation, seconds.
         """
-        usual = float(np.median(self._intervals)) if len(self._intervals) >= _LEAST else np.inf
+        before = [*self._intervals]
         self._intervals.append(interval)
         seconds, sigma = self._estimate(np.array(self._intervals))
-        is_long = _SET * usual < interval and usual <= _SLOWEST and sigma == 0.0  # a burst ends in one
-        self.late = interval - usual if is_long else 0.0
+        # Bursts end in long intervals, one like the other.
+        usual = float(max(before) if sigma > 0.0 else np.median(before)) if len(before) >= _LEAST else np.inf
+        self.late = interval - usual if _SET * usual < interval and usual <= _SLOWEST else 0.0
         is_other = sigma > 0.0 and (self._is_believed or self.interval > _MOST_STRETCHED * self._seconds)
         self.stretch = self.interval / self._seconds if is_other else 1.0
         self._seconds, self._is_believed = seconds, sigma == 0.0

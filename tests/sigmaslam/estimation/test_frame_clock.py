@@ -98,7 +98,8 @@ def test_what_was_learned_by_intervals_within_a_burst_is_made_good():
         ([0.1] * 9 + [0.2], 0.0),  # one frame is missing
         ([0.8] * 9 + [4.0], 0.0),  # so slow a camera's frames were chosen
         ([0.1] * 9 + [0.6, 0.1], 0.0),
-        ([0.004] * 4 + [0.484], 0.0),  # a burst ends
+        (([0.004] * 4 + [0.484]) * 2, 0.0),  # a burst ends as the one before
+        ([0.08, 0.12] * 8 + [0.62], 0.5),  # a clock that jitters was set
     ],
 )
 def test_a_long_interval_may_be_a_clock_that_was_set(intervals: list[float], late: float):
