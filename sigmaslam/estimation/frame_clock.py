@@ -24,6 +24,11 @@ _TAKES_TURNS = 0.75
 _SLOWEST = 0.5
 # Times the usual interval, from which on frames may be missing or the clock have been set; flow tells less.
 _SET = 2.5
+# Of the mean interval, standard deviation: a camera is as regular, whatever its stamps are; where frames are dropped
+# between such stamps flow tells. With more, near landmarks are not searched for, as they may be anywhere.
+_IRREGULAR = 0.25
+# What was learned of velocities by intervals that were so many times too short is made good.
+_MOST_STRETCHED = 2.0
 # Of the mean interval: no two frames of a camera are closer.
 _LEAST_STEP = 0.1
 
@@ -61,13 +66,14 @@ class FrameClock:
     are, to the bit.
 
     Attributes:
-        was_believed: stamps before the last one were taken as they are.
+        stretch: by which the interval before the last one was too short, as it turns out now, or 1: what was learned
+            of velocities by it is as wrong.
         late: seconds by which the last interval is longer than usual, if the clock may have been set in it, or 0.
     """
 
     def __init__(self) -> None:
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
-        self.was_believed, self._is_believed, self.late = True, True, 0.0
+        self._is_believed, self._seconds, self.late, self.stretch = True, 0.0, 0.0, 1.0
 
     @property
     def interval(self) -> float:
@@ -85,19 +91,29 @@ class FrameClock:
         Returns:
             The time between the two frames, and its standard deviation, seconds.
         """
-        usual = float(np.median(self._intervals)) if len(self._intervals) >= _LEAST else np.inf
-        self.late = interval - usual if _SET * usual < interval and usual <= _SLOWEST else 0.0
+        before = [*self._intervals]
         self._intervals.append(interval)
-        steps = np.array(self._intervals)
+        seconds, sigma = self._estimate(np.array(self._intervals))
+        # Bursts end in long intervals, one like the other.
+        usual = float(max(before) if sigma > 0.0 else np.median(before)) if len(before) >= _LEAST else np.inf
+        self.late = interval - usual if _SET * usual < interval and usual <= _SLOWEST else 0.0
+        is_other = sigma > 0.0 and (self._is_believed or self.interval > _MOST_STRETCHED * self._seconds)
+        self.stretch = self.interval / self._seconds if is_other else 1.0
+        self._seconds, self._is_believed = seconds, sigma == 0.0
+        return seconds, sigma
+
+    def _estimate(self, steps: np.ndarray) -> tuple[float, float]:
+        """What `tick` returns for the last of these intervals (N,)."""
         noise = stamp_noise(steps) if len(steps) >= _LEAST else _first_noise(steps)
-        self.was_believed, self._is_believed = self._is_believed, noise == 0.0
         if noise == 0.0:
-            return interval, 0.0
+            return float(steps[-1]), 0.0
         mean = float(steps.mean())
+        # What the mean is off by, as it may hold one long interval too many, is part of it.
+        regular = max(_IRREGULAR * mean, float(steps.max()) / len(steps))
         at_once = steps < _LEAST_STEP * mean
         if (at_once[1:] & at_once[:-1]).any():
             # Bursts of three or more: how many frames came in a time is known, not when each was taken.
-            return mean, float(steps.std())
+            return mean, min(float(steps.std()), regular)
         own = max(float(steps.var()) - 2.0 * noise**2, 0.0)
         # Times relative to a regular clock that starts with the first stamp.
         stamp = ahead = before = 0.0
@@ -107,7 +123,7 @@ class FrameClock:
             variance += own
             gain = variance / (variance + noise**2)
             ahead, variance = ahead + gain * (stamp - ahead), (1.0 - gain) * variance
-        return max(mean + ahead - before, _LEAST_STEP * mean), noise
+        return max(mean + ahead - before, _LEAST_STEP * mean), min(noise, max(regular, float(np.sqrt(own))))
 
 
 def _first_noise(steps: np.ndarray) -> float:

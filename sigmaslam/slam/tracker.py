@@ -194,9 +194,9 @@ class StereoTracker:
         clock.lap("rectify")
         if self._course.timestamp is not None:
             seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
-            if sigma > 0.0 and self._clock.was_believed:
-                # It was learned by wrong times.
-                self._motion.set_twist(np.zeros(6), initial_twist_sigma(self.config, self._window.depth))
+            if (stretch := self._clock.stretch) != 1.0:
+                twist_sigma = initial_twist_sigma(self.config, self._window.depth)
+                self._motion.set_twist(self._motion.twist / stretch, twist_sigma)
             self._motion.predict(seconds, densities(self.config, self._window.depth), sigma, timestamp)
         is_repeated = self._last_pairs.is_repeated(left, right)
         matches, fit, change, doubts = GuidedMatches.empty(), None, None, Doubts()

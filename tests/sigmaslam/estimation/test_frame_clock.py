@@ -72,6 +72,24 @@ def test_bursts_are_no_pauses_of_a_fast_camera(size: int):
     assert (np.abs(found[:, 0] - 0.1) < found[:, 1]).all()
 
 
+@pytest.mark.parametrize("size", [2, 3, 5])
+def test_frames_of_bursts_are_known_to_be_regular_once_some_were_seen(size: int):
+    """A sigma of a whole interval leaves near landmarks unsearched."""
+    stamps = 0.1 * size * (np.arange(FRAMES) // size + 1) + 0.004 * (np.arange(FRAMES) % size)
+    found = np.array(steps_of(stamps))[2 * size + 10 :]
+    assert (np.abs(found[:, 0] - 0.1) < found[:, 1]).all()
+    assert (found[:, 1] < 0.05).all()
+
+
+def test_what_was_learned_by_intervals_within_a_burst_is_made_good():
+    clock, stretches = FrameClock(), []
+    for step in [0.004, 0.004, 0.004, 0.006, 0.5, 0.004, 0.004]:
+        clock.tick(step)
+        stretches.append(clock.stretch)
+    assert stretches[4] == pytest.approx(0.1036 / 0.006, rel=0.1)
+    assert stretches[:3] + stretches[5:] == [1.0] * 5
+
+
 @pytest.mark.parametrize(
     ("intervals", "late"),
     [
@@ -80,6 +98,8 @@ def test_bursts_are_no_pauses_of_a_fast_camera(size: int):
         ([0.1] * 9 + [0.2], 0.0),  # one frame is missing
         ([0.8] * 9 + [4.0], 0.0),  # so slow a camera's frames were chosen
         ([0.1] * 9 + [0.6, 0.1], 0.0),
+        (([0.004] * 4 + [0.484]) * 2, 0.0),  # a burst ends as the one before
+        ([0.08, 0.12] * 8 + [0.62], 0.5),  # a clock that jitters was set
     ],
 )
 def test_a_long_interval_may_be_a_clock_that_was_set(intervals: list[float], late: float):

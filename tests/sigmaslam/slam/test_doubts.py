@@ -80,6 +80,17 @@ def test_stamps_that_can_be_read_leave_poses_right(demo: Demo, fault: str):
     assert fault != "none" or not any(each.doubts for each in estimates)
 
 
+def test_a_velocity_that_was_learned_within_a_burst_is_unlearned(demo: Demo):
+    """Stamps that vary by a little within the first burst are no reason to believe the others."""
+    camera, frames, truth = demo
+    good = [DrivenFrame(k, each.timestamp, each.left, each.right) for k, each in enumerate(frames[:12])]
+    tracker = StereoTracker(camera)
+    for k, each in enumerate(spoil("bursts_5", good, 7)):
+        tracker.step(each.left, each.right, each.timestamp + 0.001 * (k % 5 == 4))
+    speeds = np.linalg.norm(np.diff(truth[:12, :3, 3], axis=0), axis=1) / (frames[1].timestamp - frames[0].timestamp)
+    assert np.linalg.norm(tracker._motion.twist[:3]) < 1.5 * speeds.max()
+
+
 @pytest.mark.parametrize("fault", ["repeated", "torn"])
 def test_an_old_pair_is_skipped_and_so_is_one_that_is_old_in_part(demo: Demo, fault: str):
     estimates, truth = driven(demo, fault)
