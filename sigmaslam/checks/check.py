@@ -9,7 +9,7 @@ from sigmaslam.checks.calibration import check_calibration
 from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
 from sigmaslam.checks.finding import Finding, has_errors, wrong
 from sigmaslam.checks.images import check_images, check_light, describe_frames
-from sigmaslam.checks.inertial import check_inertial, check_odometry
+from sigmaslam.checks.inertial import check_inertial, check_times
 from sigmaslam.checks.inertial_agreement import check_motion
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
@@ -73,7 +73,7 @@ def check_sequence(
     if sequence.imu is not None:
         findings.append(check_inertial(sequence.imu, sequence.timestamps))
     if sequence.odometry is not None:
-        findings.append(check_odometry(sequence.odometry, sequence.timestamps))
+        findings.append(check_times(sequence.odometry, sequence.timestamps))
     if not steps:
         return Check(findings, [], [], EyeMatches.empty())
     images = check_images([(frame.left, frame.right) for frame, _ in steps])

@@ -42,7 +42,7 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
         cure = f"it is in {unit}: give m/s^2" if unit else "are its columns those of the specific force in m/s^2?"
         message = f"{source}: specific force is {length:.3g} in the median, not 9.81: {cure}"
         return Finding(_NAME, "error", message, length)
-    found = _check_times(_NAME, recording, timestamps, _LEAST_RATE)
+    found = check_times(recording, timestamps, _NAME, _LEAST_RATE)
     for name, values, ranges in (("rate", samples.gyro, _RATES), ("force", samples.accel, _FORCES)):
         peak, count = _saturated(values, ranges)
         if count and found.severity != "error":
@@ -54,19 +54,13 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
     return found
 
 
-def check_odometry(recording: OdometryRecording, timestamps: Sequence[float] | None) -> Finding:
-    """The worst that is wrong with the times of odometry; velocities are judged while tracking, by those of the images.
-
-    Args:
-        recording: the table.
-        timestamps: of the images, seconds; None where they are not known.
-    """
-    return _check_times("odometry", recording, timestamps, _LEAST_ODOMETRY_RATE)
-
-
-def _check_times(
-    name: str, recording: InertialRecording | OdometryRecording, images: Sequence[float] | None, least_rate: float
+def check_times(
+    recording: InertialRecording | OdometryRecording,
+    images: Sequence[float] | None,
+    name: str = "odometry",
+    least_rate: float = _LEAST_ODOMETRY_RATE,
 ) -> Finding:
+    """The worst that is wrong with a table's times, and with those of images beside it, seconds; None: unknown."""
     t, source = recording.samples.timestamp, recording.source
     intervals = np.diff(t)
     rate = 1.0 / float(np.median(intervals))

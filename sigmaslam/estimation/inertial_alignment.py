@@ -64,12 +64,7 @@ class Alignment:
 
 
 def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
-    """Whether the gyro's turns are those of the images, so that unit, axes and clock are right.
-
-    Args:
-        bodies: (N, 4, 4) poses of the sensor.
-        motions: N - 1, between successive poses, integrated with the gyro's bias.
-    """
+    """Whether the gyro's turns between poses (N, 4, 4) of the sensor are theirs: unit, axes and clock are right."""
     R = bodies[:, :3, :3]
     seen = rotation_log(R[:-1].transpose(0, 2, 1) @ R[1:])
     measured = rotation_log(np.array([each.turn for each in motions]))
@@ -78,12 +73,7 @@ def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
 
 
 def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray]:
-    """Gyro bias (3,), beside the one that the motions were integrated with, and its covariance (3, 3).
-
-    Args:
-        bodies: (N, 4, 4) poses of the sensor.
-        motions: N - 1, between successive poses.
-    """
+    """Gyro bias (3,), beside the one that motions between poses (N, 4, 4) were integrated with, and its covariance."""
     R = bodies[:, :3, :3]
     turns = np.array([each.turn for each in motions])
     slope = np.concatenate([each.slope[TURN, GYRO_BIAS] for each in motions])
@@ -191,11 +181,7 @@ class GravitySearch:
     ) -> Alignment | None:
         """Takes the pose (4, 4) T_first_camera of a time; what is known with it, with the whole of the gyro's bias.
 
-        Args:
-            time, pose: of the last frame.
-            samples: of the sensor.
-            T_camera_imu: (4, 4) its mounting.
-            densities: as of `InertialBuffer.preintegrate`.
+        `densities` are as of `InertialBuffer.preintegrate`.
         """
         self.poses.append((time, pose))
         while self.poses[0][0] < time - _LONGEST or (

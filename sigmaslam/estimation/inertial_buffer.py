@@ -9,8 +9,8 @@ from sigmaslam.estimation.preintegration import Preintegrated, preintegrate
 from sigmaslam.estimation.sample_buffer import SampleBuffer
 from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 
-# The noise that is learned begins at five times the densities of a data sheet, which hold at rest: in flight others
-# take 3 to 17 times as much. A frame changes it by this share, and none counts for more than so many variances.
+# The noise is at least five times that of a data sheet, which holds at rest: in flight it is 3 to 17 times that, and
+# small departures show that images are better than they claim. A frame changes what is learned by this share.
 _FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 3.0
 # So many times the densities' variance is no noise any more but another fault.
 _LARGEST_SCALE = 1e4
@@ -55,7 +55,8 @@ class LearnedNoise:
 
     def of(self, motion: Preintegrated) -> np.ndarray:
         """(9, 9) covariance of a preintegrated motion."""
-        return np.asarray(self.scale[0] * motion.gyro_noise + self.scale[1] * motion.accel_noise)
+        gyro, accel = np.maximum(self.scale, _FIRST_SCALE)
+        return np.asarray(gyro * motion.gyro_noise + accel * motion.accel_noise)
 
     def learn(self, departure: np.ndarray, removed: np.ndarray) -> None:
         """Takes how far a pose lies from its prediction.

@@ -58,7 +58,7 @@ class GyroAttitude:
     def __init__(self, samples: InertialSamples) -> None:
         self._t, self._gyro = samples.timestamp, samples.gyro
         mean = 0.5 * (self._gyro[1:] + self._gyro[:-1])
-        self._attitude = _products(rotation_exp(mean * np.diff(self._t)[:, None]))
+        self._attitude = rotation_products(rotation_exp(mean * np.diff(self._t)[:, None]))
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """(N, 3, 3) at times (N,) of the sensor's clock; those outside of the table count as its ends."""
@@ -145,7 +145,7 @@ def _match(seen: np.ndarray, gyro: np.ndarray, seconds: np.ndarray) -> tuple[flo
     return scale, rotation, weight @ (gyro - scale * seen @ rotation.T), left / squared_b
 
 
-def _products(steps: np.ndarray) -> np.ndarray:
+def rotation_products(steps: np.ndarray) -> np.ndarray:
     """Products (N + 1, 3, 3) of the first 0, 1, ... N rotations, by doubling."""
     R, reach = np.concatenate([np.eye(3)[None], steps]), 1
     while reach < len(R):

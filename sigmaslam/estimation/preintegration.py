@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.estimation.inertial_turns import rotation_products
 from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 from sigmaslam.geometry.se3 import rotation_exp, skew
 
@@ -100,10 +101,7 @@ def preintegrate(
     spectra[is_missing] += unknown[is_missing]
     rates, forces = (0.5 * (values[1:] + values[:-1]) for values in (gyro, accel))
     halves = rotation_exp(0.5 * steps[:, None] * rates)
-    rotations = np.empty((len(edges), 3, 3))
-    rotations[0] = np.eye(3)
-    for k, whole in enumerate(halves @ halves):
-        rotations[k + 1] = rotations[k] @ whole
+    rotations = rotation_products(halves @ halves)
     turn, turned, h = rotations[-1], rotations[:-1] @ halves, steps[:, None]
     moved = (turned @ forces[..., None])[..., 0]
     speeds = np.vstack([np.zeros(3), np.cumsum(h * moved, axis=0)])

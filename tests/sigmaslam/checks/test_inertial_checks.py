@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmaslam.checks.inertial import check_inertial, check_odometry
+from sigmaslam.checks.inertial import check_inertial, check_times
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.odometry_sensor import OdometrySamples, OdometrySensor
 from sigmaslam.readers.inertial import InertialRecording
@@ -68,6 +68,6 @@ def test_times_of_odometry_are_judged(period, shift, severity, message):
     t = np.arange(0, 5, period)
     samples = OdometrySamples(t, np.zeros((len(t), 3)), np.zeros((len(t), 3)))
     recording = OdometryRecording(Path("wheels.csv"), OdometrySensor(np.eye(4), shift), samples)
-    found = check_odometry(recording, IMAGES.tolist())
+    found = check_times(recording, IMAGES.tolist())
     assert (found.name, found.severity) == ("odometry", severity)
     assert message in found.message

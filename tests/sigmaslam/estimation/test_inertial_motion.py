@@ -3,6 +3,7 @@ import logging
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
 from sigmaslam.estimation.inertial_motion import InertialMotion
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
@@ -111,11 +112,11 @@ def test_gravity_and_biases_are_found_in_a_second():
 
 @pytest.mark.slow
 def test_dark_seconds_stay_within_what_is_claimed():
-    """Thirty flights, places some 0.5 m apart every half second; `pytest -s -m slow -k claimed` prints the figures."""
+    """A hundred flights, places 0.5 m apart every half second; `pytest -s -m slow -k claimed` prints the figures."""
     errors: dict[float, list[float]] = {0.0: [], 0.5: [], 1.0: [], 2.0: []}
     nees: dict[float, list[dict[str, float]]] = {seconds: [] for seconds in errors}
     within = []
-    for seed in range(811_100, 811_130):
+    for seed in range(60_100, 60_200):
         flight = Flight(seed, wrong=True)
         flight.fly(50)
         assert flight.filter.is_inertial
@@ -129,12 +130,28 @@ def test_dark_seconds_stay_within_what_is_claimed():
         mean = {name: float(np.mean([each[name] for each in found])) for name in found[0]}
         worst, median = max(errors[seconds]), float(np.median(errors[seconds]))
         print(f"{seconds:g} s: median {median:.3f} m, worst {worst:.3f} m, NEES {mean}")
-        assert all(0.5 < each < 1.6 for each in mean.values()), mean
+        assert all(0.7 < each < 1.4 for each in mean.values()), mean
         if seconds == 1.0:
             assert median < 0.04
             assert worst < 0.1
     print(f"after 2 s {np.mean(within):.0%} within 2.5 sigma")
-    assert np.mean(within) > 0.75
+    # Of right covariances 90 % are, of a hundred flights 81 to 99 %.
+    assert np.mean(within) > 0.81
+
+
+def test_images_that_are_better_than_they_claim_do_not_make_the_sensor_certain():
+    buffer, noise = InertialBuffer(SENSOR), LearnedNoise()
+    for column in zip(*Motion(0).measure(np.arange(0.0, 0.1, 0.005)).columns(), strict=True):
+        buffer.add(*column)
+    motion = buffer.preintegrate(0.02, 0.07, np.zeros(6), DENSITIES)
+    before = noise.of(motion)
+    for _ in range(200):
+        noise.learn(np.zeros(6), np.eye(6))
+    assert noise.scale.max() < 2.0
+    np.testing.assert_array_equal(noise.of(motion), before)
+    for _ in range(200):
+        noise.learn(np.full(6, 3.0), np.eye(6))
+    assert (np.diag(noise.of(motion)) > np.diag(before)).all()
 
 
 def test_at_rest_gravity_is_found_as_well():
