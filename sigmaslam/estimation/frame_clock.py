@@ -24,7 +24,7 @@ _TAKES_TURNS = 0.75
 _SLOWEST = 0.5
 # Times the usual interval, from which on frames may be missing or the clock have been set or wrong; flow tells less.
 _SET = 2.5
-# Of the mean interval: cameras are as regular, whatever their stamps are. With more near landmarks are not searched for.
+# Of the mean interval: cameras are as regular, whatever their stamps. With more near landmarks are not searched for.
 _IRREGULAR = 0.25
 # Of the mean interval: no two frames of a camera are closer.
 _LEAST_STEP = 0.1
