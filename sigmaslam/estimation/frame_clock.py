@@ -22,13 +22,10 @@ _MOST_DROPPED = 4
 _TAKES_TURNS = 0.75
 # Seconds. A slower camera's frames were chosen, and a host is late by less; the motion in between is unknown anyway.
 _SLOWEST = 0.5
-# Times the usual interval, from which on frames may be missing or the clock have been set; flow tells less.
+# Times the usual interval, from which on frames may be missing or the clock have been set or wrong; flow tells less.
 _SET = 2.5
-# Of the mean interval, standard deviation: a camera is as regular, whatever its stamps are; where frames are dropped
-# between such stamps flow tells. With more, near landmarks are not searched for, as they may be anywhere.
+# Of the mean interval: cameras are as regular, whatever their stamps. With more near landmarks are not searched for.
 _IRREGULAR = 0.25
-# What was learned of velocities by intervals that were so many times too short is made good.
-_MOST_STRETCHED = 2.0
 # Of the mean interval: no two frames of a camera are closer.
 _LEAST_STEP = 0.1
 
@@ -62,12 +59,10 @@ class FrameClock:
     """Tells how long it is since the last frame, and how well that is known.
 
     A Kalman filter of the frame's time: it moves on by the mean interval, with the variance that intervals have beside
-    the noise of stamps, and a stamp is measured with that noise. Where stamps can be believed they are taken as they
-    are, to the bit.
+    the noise of stamps, by which a stamp is measured. Stamps that can be believed are taken to the bit.
 
     Attributes:
-        stretch: by which the interval before the last one was too short, as it turns out now, or 1: what was learned
-            of velocities by it is as wrong.
+        stretch: by what velocities are too large that were learned by a wrong interval, or 1.
         late: seconds by which the last interval is longer than usual, if the clock may have been set in it, or 0.
     """
 
@@ -97,7 +92,7 @@ class FrameClock:
         # Bursts end in long intervals, one like the other.
         usual = float(max(before) if sigma > 0.0 else np.median(before)) if len(before) >= _LEAST else np.inf
         self.late = interval - usual if _SET * usual < interval and usual <= _SLOWEST else 0.0
-        is_other = sigma > 0.0 and (self._is_believed or self.interval > _MOST_STRETCHED * self._seconds)
+        is_other = sigma > 0.0 and (self._is_believed or self.interval > _SET * self._seconds)
         self.stretch = self.interval / self._seconds if is_other else 1.0
         self._seconds, self._is_believed = seconds, sigma == 0.0
         return seconds, sigma
@@ -116,8 +111,7 @@ class FrameClock:
             return mean, min(float(steps.std()), regular)
         own = max(float(steps.var()) - 2.0 * noise**2, 0.0)
         # Times relative to a regular clock that starts with the first stamp.
-        stamp = ahead = before = 0.0
-        variance = noise**2
+        stamp, ahead, before, variance = 0.0, 0.0, 0.0, noise**2
         for step in steps:
             stamp, before = stamp + step - mean, ahead
             variance += own

@@ -60,8 +60,7 @@ def find_epipolar_geometry(points0: np.ndarray, points1: np.ndarray) -> Uncertai
     if np.shape(F) != (3, 3) or chosen.sum() < _LEAST_MATCHES:
         return None
     inliers = chosen.ravel().astype(bool)
-    to0, to1 = _normalisation(points0[inliers]), _normalisation(points1[inliers])
-    scaled0, scaled1 = _homogeneous(points0[inliers]) @ to0.T, _homogeneous(points1[inliers]) @ to1.T
+    (to0, scaled0), (to1, scaled1) = normalised(points0[inliers]), normalised(points1[inliers])
     start = np.linalg.inv(to1).T @ F @ np.linalg.inv(to0)
     slopes = np.column_stack([(scaled0 @ start.T)[:, :2], (scaled1 @ start)[:, :2]])
     weight = 1.0 / np.maximum(np.linalg.norm(slopes, axis=1), 1e-12)
@@ -112,11 +111,12 @@ def _near_lines(geometry: UncertainGeometry, pixels0: np.ndarray, pixels1: np.nd
     return near.sum(axis=1), np.nonzero(near)[1]
 
 
-def _normalisation(points: np.ndarray) -> np.ndarray:
-    """Similarity (3, 3) that takes points (M, 2) to mean zero and root mean square distance sqrt(2)."""
+def normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Similarity (3, 3) to mean zero and root mean square distance sqrt(2), and homogeneous points (M, 3) after it."""
     mean = points.mean(axis=0)
     scale = np.sqrt(2.0 / max(((points - mean) ** 2).sum(axis=1).mean(), 1e-12))
-    return np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0.0, 0.0, 1.0]])
+    T = np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0.0, 0.0, 1.0]])
+    return T, _homogeneous(points) @ T.T
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.epipolar_search import normalised
 from sigmaslam.geometry.se3 import rotation_exp, skew
 from sigmaslam.two_view.epipolar import MatchedRays, neighbours_factor, robust_weight
 
@@ -86,7 +87,7 @@ def estimate_fundamental(
     if np.shape(start) != (3, 3):
         return None
     # Pixels are scaled alike in both images, so that F is well conditioned and residuals keep their meaning.
-    (to0, scaled0), (to1, scaled1) = _normalised(points0), _normalised(points1)
+    (to0, scaled0), (to1, scaled1) = normalised(points0), normalised(points1)
     spread0 = (sigma0 * to0[0, 0]) ** 2 * np.eye(2)
     matches = MatchedRays(scaled0, scaled1, spread0, to1[0, 0] ** 2 * covariance.astype(np.float64))
     F = np.linalg.inv(to1).T @ start @ np.linalg.inv(to0)
@@ -180,14 +181,6 @@ def _refine(
         if np.abs(step).max() < _CONVERGED:
             break
     return u, angle, v
-
-
-def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Similarity (3, 3) to mean zero and root mean square distance sqrt(2), and homogeneous points (M, 3) after it."""
-    mean = points.mean(axis=0)
-    scale = np.sqrt(2.0 / ((points - mean) ** 2).sum(axis=1).mean())
-    T = np.array([[scale, 0.0, -scale * mean[0]], [0.0, scale, -scale * mean[1]], [0.0, 0.0, 1.0]])
-    return T, np.column_stack([points, np.ones(len(points))]) @ T.T
 
 
 def _compose(u: np.ndarray, angle: float, v: np.ndarray) -> np.ndarray:
