@@ -104,6 +104,46 @@ def find_second_motion(
     return SecondMotion(fit, pose, agreeing, expected[agreeing], departure, is_mover)
 
 
+def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFit) -> SecondMotion | None:
+    """What moves before farther landmarks, and their pose; None where nearer ones agree with that.
+
+    Far parts hardly tell a translation: a body before them decides it, and all agree. The scores show it to first
+    order, at no cost; then the pose of the others is found.
+    """
+    window, views = localiser.window, matches.views
+    rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
+    disparity = window.landmarks.estimate[rows, 2]
+    for share in _NEAREST:
+        near = disparity > np.quantile(disparity[fit.inliers], 1.0 - share)
+        drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
+        if not _is_beyond(fit.scores[drawn].sum(axis=0), rest.T @ rest):
+            continue
+        others = replace(matches, views=views.select(~near), probability=matches.probability[~near])
+        far = localiser.fit_near(others, prediction)
+        if far is None or not _contradicts(far, fit):
+            continue
+        by_fit, by_far = (seen_from(window, rows, each.pose) for each in (fit, far))
+        departure = views.measurement[:, :2] - by_far[:, :2]
+        moves = np.flatnonzero(drawn & ~are_one_place(np.linalg.norm(departure, axis=1)))
+        apart = np.linalg.norm((by_far - by_fit)[drawn, :2], axis=1)
+        if len(moves) >= MIN_POINTS and not see_the_same(apart):
+            far = replace(far, inliers=_among(np.flatnonzero(~near)[far.inliers], len(rows)))
+            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True)
+    return None
+
+
+def _contradicts(part: FrameFit, fit: FrameFit) -> bool:
+    """Whether the pose of a part of the matches departs from that of all by more than its own errors."""
+    common = part.joint.common[-6:] - fit.joint.common[-6:]
+    spread = max(part.nis_before_scaling, 1.0) * part.clustering * part.relative + common @ common.T
+    return _is_beyond(se3_log(part.pose @ se3_inverse(fit.pose)), spread)
+
+
+def _is_beyond(error: np.ndarray, covariance: np.ndarray) -> bool:
+    """Whether an error (6,) is no chance."""
+    return float(error @ np.linalg.lstsq(covariance, error, rcond=1e-14)[0]) > CHI_SQUARE_9999_OF_6
+
+
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:
     """(M,) bool, as much of the image as matches explain of which the median departs from a pose.
 
@@ -123,37 +163,3 @@ def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) 
 def _among(chosen: np.ndarray, count: int) -> np.ndarray:
     """(count,) bool of indices."""
     return np.isin(np.arange(count), chosen)
-
-
-def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFit) -> SecondMotion | None:
-    """What moves before farther landmarks, and their pose; None where nearer ones agree with that.
-
-    Far parts hardly tell a translation: a body before them decides it, and all agree. Neighbours err alike then.
-    """
-    if fit.clustering < ACCEPTANCE.usual_clustering:
-        return None
-    window, views = localiser.window, matches.views
-    rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
-    expected = seen_from(window, rows, fit.pose)
-    for share in _NEAREST:
-        near = expected[:, 2] > np.nanquantile(expected[fit.inliers, 2], 1.0 - share)
-        others = replace(matches, views=views.select(~near), probability=matches.probability[~near])
-        far = localiser.fit_near(others, prediction)
-        if far is None or not _contradicts(far, fit):
-            continue
-        by_far, drawn = seen_from(window, rows, far.pose), near & fit.inliers
-        departure = views.measurement[:, :2] - by_far[:, :2]
-        moves = np.flatnonzero(drawn & ~are_one_place(np.linalg.norm(departure, axis=1)))
-        apart = np.linalg.norm((by_far - expected)[drawn, :2], axis=1)
-        if len(moves) >= MIN_POINTS and not see_the_same(apart):
-            far = replace(far, inliers=_among(np.flatnonzero(~near)[far.inliers], len(rows)))
-            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True)
-    return None
-
-
-def _contradicts(part: FrameFit, fit: FrameFit) -> bool:
-    """Whether the pose of a part of the matches departs from that of all by more than its own errors."""
-    common = part.joint.common[-6:] - fit.joint.common[-6:]
-    spread = max(part.nis_before_scaling, 1.0) * part.clustering * part.relative + common @ common.T
-    step = se3_log(part.pose @ se3_inverse(fit.pose))
-    return float(step @ np.linalg.lstsq(spread, step, rcond=1e-14)[0]) > CHI_SQUARE_9999_OF_6
