@@ -83,7 +83,10 @@ class Scrutiny:
             doubts.add_motion(matches.rival, fit.pose)
         self._doubt_prediction(doubts, fit)
         if second is not None and not second.is_mover and not self._is_other(second, fit):
-            self._take_rival(matches, fit, second)
+            # Nothing decides between the two as long as what asks for the other moves.
+            self._T_rival_fit = second.pose @ se3_inverse(fit.pose)
+            if moving is not None:
+                self._add(self._rival, matches, second)
             doubts.add_motion(second.pose, fit.pose)
         elif self._rival:
             doubts.add_motion(self._T_rival_fit @ fit.pose, fit.pose)
@@ -103,12 +106,6 @@ class Scrutiny:
         still = replace(matches, views=views.select(~moves), probability=matches.probability[~moves])
         again = self._localiser.fit_again(still, fit, Prediction.of(window, self._motion))
         return (matches, fit) if again is fit else (still, again)
-
-    def _take_rival(self, matches: GuidedMatches, fit: FrameFit, second: SecondMotion) -> None:
-        """Remembers a pose between which and that of the fit nothing decides, as long as what asks for it moves."""
-        self._T_rival_fit = second.pose @ se3_inverse(fit.pose)
-        if self._moving is not None:
-            self._add(self._rival, matches, second)
 
     def _add(self, region: MovingRegion, matches: GuidedMatches, second: SecondMotion) -> None:
         points = transform_points(second.first.pose, self._window.camera.triangulate(second.expected))

@@ -11,7 +11,6 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.geometry.image_cells import explained_area, image_cells
-from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
@@ -76,7 +75,8 @@ def find_second_motion(
     first, most = (explained_area(cells, each, equal) for each in (fit.inliers, possible))
     if possible.sum() < MIN_POINTS or most < least * (first + most):
         return None
-    covariance = window.landmarks.covariance[rows[others], :3, :3]
+    landmarks = window.landmarks
+    covariance = landmarks.covariance[rows[others], :3, :3]
     relative = estimate_relative_pose(
         camera,
         expected[others],
@@ -93,14 +93,13 @@ def find_second_motion(
     departure = views.measurement[agreeing, :2] - expected[agreeing, :2]
     apart = np.linalg.norm(departure, axis=1)
     nearer = stands_before(*(float(np.median(expected[chosen, 2])) for chosen in (agreeing, fit.inliers)))
-    stood_still = np.median(window.landmarks.views[rows[agreeing]]) >= CONFIRMED
     differs, many = not see_the_same(apart), len(agreeing) >= ACCEPTANCE.mover_points * MIN_POINTS
     is_rival = differs and share >= ACCEPTANCE.second_motion
     moves = moving is not None and nearer and (bool(moving) or (differs and many and share >= ACCEPTANCE.mover))
     if not (is_rival or moves):
         return None
     pose = fit.pose @ relative.T_key_camera
-    is_mover = nearer and (share < ACCEPTANCE.second_motion or not stood_still)
+    is_mover = nearer and (share < ACCEPTANCE.second_motion or np.median(landmarks.views[rows[agreeing]]) < CONFIRMED)
     return SecondMotion(fit, pose, agreeing, expected[agreeing], departure, is_mover)
 
 
@@ -116,13 +115,15 @@ def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFi
     for share in _NEAREST:
         near = disparity > np.quantile(disparity[fit.inliers], 1.0 - share)
         drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
-        if not _is_beyond(fit.scores[drawn].sum(axis=0), rest.T @ rest):
+        pull = fit.scores[drawn].sum(axis=0)
+        if pull @ np.linalg.lstsq(rest.T @ rest, pull, rcond=1e-14)[0] < CHI_SQUARE_9999_OF_6:
             continue
         others = replace(matches, views=views.select(~near), probability=matches.probability[~near])
         far = localiser.fit_near(others, prediction)
         if far is None or not _contradicts(far, fit):
             continue
         by_fit, by_far = (seen_from(window, rows, each.pose) for each in (fit, far))
+        drawn &= np.isfinite(by_far[:, 0])
         departure = views.measurement[:, :2] - by_far[:, :2]
         moves = np.flatnonzero(drawn & ~are_one_place(np.linalg.norm(departure, axis=1)))
         apart = np.linalg.norm((by_far - by_fit)[drawn, :2], axis=1)
@@ -136,23 +137,13 @@ def _contradicts(part: FrameFit, fit: FrameFit) -> bool:
     """Whether the pose of a part of the matches departs from that of all by more than its own errors."""
     common = part.joint.common[-6:] - fit.joint.common[-6:]
     spread = max(part.nis_before_scaling, 1.0) * part.clustering * part.relative + common @ common.T
-    return _is_beyond(se3_log(part.pose @ se3_inverse(fit.pose)), spread)
-
-
-def _is_beyond(error: np.ndarray, covariance: np.ndarray) -> bool:
-    """Whether an error (6,) is no chance."""
-    return float(error @ np.linalg.lstsq(covariance, error, rcond=1e-14)[0]) > CHI_SQUARE_9999_OF_6
+    return Prediction(fit.pose, spread).excludes(part.pose)
 
 
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:
-    """(M,) bool, as much of the image as matches explain of which the median departs from a pose.
+    """(M,) bool, as much of the image (M cells) as some of `others` (K,) explain that depart (K pixels) in the median.
 
     Those are at most all that depart and, with them, as many that do not: of these the ones that explain the most.
-
-    Args:
-        cells: (M,) of all matches.
-        others: (K,) numbers of those that may agree.
-        departs: (K,) pixels from where the pose sees them.
     """
     share = 1.0 / np.bincount(cells)[cells[others]]
     same = are_one_place(departs)
