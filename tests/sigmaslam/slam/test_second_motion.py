@@ -18,7 +18,7 @@ from sigmaslam.slam.second_motion import SecondMotion, _among, _most_departing, 
 from sigmaslam.two_view.scene_pose import see_the_same
 from tests.support.dense_window import CAMERA, DEPTH, ITERATIONS, NO_WALK, make_window
 
-FAR, NEAR, POSE = 160, 50, se3_exp([0.02, 0.01, 0.02, 0.004, -0.003, 0.002])
+FAR, NEAR, POSE = 160, 50, se3_exp(np.array([0.02, 0.01, 0.02, 0.004, -0.003, 0.002]))
 
 
 @pytest.mark.parametrize("seed", range(6))
