@@ -41,6 +41,7 @@ class FrameFit:
         nis, dof: of the inliers.
         noise_scale: what the variances of all views are multiplied by in the posterior, 1 or more, as they scatter.
         clustering: by what errors that neighbours share make `relative` too small, 1 or more; not applied to it.
+        scores: (M, 6) slope of each view's log-likelihood by the pose.
         inflation: by what `relative` was multiplied for errors that all views share.
     """
 
@@ -54,6 +55,7 @@ class FrameFit:
     dof: int
     noise_scale: float
     clustering: float
+    scores: np.ndarray
     inflation: float = 1.0
 
     @property

@@ -131,6 +131,7 @@ class FrameUpdate:
             int(views.components[inliers].sum()),
             float(noise_scale),
             clustering(views.measurement[:, :2], size, scores, information[frame, frame]),
+            scores,
         )
 
     def _prior_factor(self, step_covariance: np.ndarray, reference: int) -> np.ndarray:

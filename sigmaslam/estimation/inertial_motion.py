@@ -202,13 +202,7 @@ class InertialMotion(MotionFilter):
         self._T_camera_imu = nearest_rigid(se3_exp(change[13:]) @ self._T_camera_imu)
 
     def _measure(self, residual: np.ndarray, slope: np.ndarray, noise: np.ndarray) -> None:
-        """Kalman update by what is measured without images.
-
-        Args:
-            residual: (m,) measured less predicted.
-            slope: (m, 25) of what is predicted, by the state.
-            noise: (m, m) covariance.
-        """
+        """Kalman update without images: measured less predicted (m,), its slope (m, 25) and its covariance (m, m)."""
         P = self._covariance
         gain = regression(P @ slope.T, slope @ P @ slope.T + noise)
         change, kept = gain @ residual, np.eye(_SIZE) - gain @ slope

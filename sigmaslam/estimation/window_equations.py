@@ -45,11 +45,7 @@ def _views(
 ) -> dict[str, np.ndarray]:
     """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`: views of landmarks (K,) by row.
 
-    Args:
-        window: at its posterior.
-        observations: O views.
-        rows: of the landmark table.
-        owner: (O,) which of these each view sees.
+    `owner` (O,) tells which of these each of the views sees.
     """
     state, landmarks, views = window.posterior, window.landmarks, observations.views
     anchor = landmarks.anchor[views.landmark]

@@ -76,10 +76,7 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.012
 def _measure(node: yaml.Node, steps: list[str], sizes: dict[int, int]) -> int:
     """Characters of a node with all that it contains, what aliases repeat included, if it is within the limits.
 
-    Args:
-        node: of the document.
-        steps: keys and numbers that lead to it.
-        sizes: of the nodes so far, by identity; zero while they are measured.
+    `sizes` are those of the nodes so far, by identity; zero while they are measured.
     """
     where = f"key '{shorten('.'.join(steps))}'"
     if len(steps) >= MAX_DEPTH:

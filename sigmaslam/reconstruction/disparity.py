@@ -149,9 +149,7 @@ def semi_global_disparity(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 def _half_size_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """(H, W) disparities, pixels of the whole size, that both eyes' images at half their size agree on; else NaN.
 
-    Args:
-        left, right: (H, W) uint8 images.
-        disparity: (H, W) found at the whole size, which says how far to search.
+    `disparity` (H, W), found at the whole size, says how far to search.
     """
     height, width = left.shape
     found = disparity[np.isfinite(disparity)]

@@ -197,12 +197,7 @@ def open_input(keyframes: RecordedKeyframes, moved_to: Path | None = None) -> St
 
 
 def _with_frames_between(keyframes: np.ndarray, count: int) -> np.ndarray:
-    """Rows of keyframes, and of frames that divide what lies between them evenly into short parts.
-
-    Args:
-        keyframes: (K,) rows, increasing.
-        count: of all rows.
-    """
+    """Increasing rows of keyframes (K,), and of frames, of `count`, that divide what lies between evenly."""
     ends = np.unique(np.r_[keyframes, count - 1])
     parts = [
         np.linspace(first, last, -(-(last - first) // MOST_FRAMES) + 1).round().astype(np.int64)

@@ -178,12 +178,7 @@ class FrameHistory:
         self._links, self._began = [_at_keyframe(link.timestamp)], link.timestamp
 
     def _forget(self, id: int, ids: list[int]) -> None:
-        """A keyframe is remembered no longer: its frames hang at those before and after it.
-
-        Args:
-            id: of the keyframe.
-            ids: of those that are remembered.
-        """
+        """A keyframe is remembered no longer, as `ids` are: its frames hang at those before and after it."""
         place = self._chain.index(id)
         keyframes, index = self._state.all_poses, {each: k for k, each in enumerate(self._ids)}
         own = index[id]

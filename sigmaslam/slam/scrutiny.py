@@ -20,7 +20,7 @@ from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.moving_region import MovingRegion
-from sigmaslam.slam.second_motion import SecondMotion, find_second_motion
+from sigmaslam.slam.second_motion import SecondMotion, find_scene_behind, find_second_motion
 from sigmaslam.two_view.stereo_pose import MIN_POINTS
 
 # So many bodies, or parts of one, are left out of an image one by one.
@@ -64,12 +64,13 @@ class Scrutiny:
         for region in (moving, self._rival):
             if region is not None:
                 region.carry(left, fit.pose, self._window.camera)
-        second = find_second_motion(self._window, matches, fit, moving)
+        second = None if moving is None else find_scene_behind(self._localiser, matches, fit)
+        second = second or find_second_motion(self._window, matches, fit, moving)
         for _ in range(_MOST_MOVERS):
             if moving is None or second is None or not second.is_mover:
                 break
             drawn = fit.pose
-            matches, fit = self._leave_out(matches, fit, second, moving)
+            matches, fit = self._leave_out(matches, second, moving)
             doubts.add_motion(drawn, fit.pose)
             second = find_second_motion(self._window, matches, fit, moving)
         if self._input_is_wrong:
@@ -82,7 +83,10 @@ class Scrutiny:
             doubts.add_motion(matches.rival, fit.pose)
         self._doubt_prediction(doubts, fit)
         if second is not None and not second.is_mover and not self._is_other(second, fit):
-            self._take_rival(matches, fit, second)
+            # Nothing decides between the two as long as what asks for the other moves.
+            self._T_rival_fit = second.pose @ se3_inverse(fit.pose)
+            if moving is not None:
+                self._add(self._rival, matches, second)
             doubts.add_motion(second.pose, fit.pose)
         elif self._rival:
             doubts.add_motion(self._T_rival_fit @ fit.pose, fit.pose)
@@ -91,11 +95,11 @@ class Scrutiny:
         return matches, fit, doubts
 
     def _leave_out(
-        self, matches: GuidedMatches, fit: FrameFit, second: SecondMotion, moving: MovingRegion
+        self, matches: GuidedMatches, second: SecondMotion, moving: MovingRegion
     ) -> tuple[GuidedMatches, FrameFit]:
         """Takes what moves out of window and matches, and poses that it drew along back."""
-        window, views = self._window, matches.views
-        self._add(moving, matches, fit, second)
+        window, views, fit = self._window, matches.views, second.first
+        self._add(moving, matches, second)
         moves = moving.covers(views.measurement[:, :2])
         window.count_sightings(views.landmark[:0], views.landmark[:0], views.landmark[moves])
         window.solve()
@@ -103,14 +107,8 @@ class Scrutiny:
         again = self._localiser.fit_again(still, fit, Prediction.of(window, self._motion))
         return (matches, fit) if again is fit else (still, again)
 
-    def _take_rival(self, matches: GuidedMatches, fit: FrameFit, second: SecondMotion) -> None:
-        """Remembers a pose between which and that of the fit nothing decides, as long as what asks for it moves."""
-        self._T_rival_fit = second.pose @ se3_inverse(fit.pose)
-        if self._moving is not None:
-            self._add(self._rival, matches, fit, second)
-
-    def _add(self, region: MovingRegion, matches: GuidedMatches, fit: FrameFit, second: SecondMotion) -> None:
-        points = transform_points(fit.pose, self._window.camera.triangulate(second.expected))
+    def _add(self, region: MovingRegion, matches: GuidedMatches, second: SecondMotion) -> None:
+        points = transform_points(second.first.pose, self._window.camera.triangulate(second.expected))
         region.add(matches.views.measurement[second.agreeing, :2], points, second.departure)
 
     def _is_fixed(self, left: np.ndarray, matches: GuidedMatches, fit: FrameFit) -> bool:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
+from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.moving_region import MovingRegion
 from sigmaslam.two_view.scene_pose import are_one_place, see_the_same, stands_before
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
+
+# Shares of the matches, the nearest ones, that may be on what moves before the scene.
+_NEAREST = (0.2, 0.35, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,30 +27,21 @@ class SecondMotion:
     """Another pose that a part of the matches asks for.
 
     Attributes:
+        first: the pose beside which it is one.
         pose: (4, 4) T_world_camera as if these landmarks stood still.
         agreeing: (K,) numbers of the matches.
         expected: (K, 3) (u, v, disparity) where the first pose sees them.
         departure: (K, 2) pixels from there to where they are.
-        share: of the image that both explain.
-        stands_before: they stand before what the first pose explains.
-        stood_still: most of them agreed with earlier poses.
+        is_mover: something before the scene, too small for a rival of it or never at rest, or what is farther says so.
+            What lies behind may be the scene, and the first pose that of what moves before it.
     """
 
+    first: FrameFit
     pose: np.ndarray
     agreeing: np.ndarray
     expected: np.ndarray
     departure: np.ndarray
-    share: float
-    stands_before: bool
-    stood_still: bool
-
-    @property
-    def is_mover(self) -> bool:
-        """Something before the scene, too small for a rival of it or never at rest.
-
-        What lies behind may be the scene, and the first pose that of what moves before it.
-        """
-        return self.stands_before and (self.share < ACCEPTANCE.second_motion or not self.stood_still)
+    is_mover: bool
 
 
 def find_second_motion(
@@ -79,7 +75,8 @@ def find_second_motion(
     first, most = (explained_area(cells, each, equal) for each in (fit.inliers, possible))
     if possible.sum() < MIN_POINTS or most < least * (first + most):
         return None
-    covariance = window.landmarks.covariance[rows[others], :3, :3]
+    landmarks = window.landmarks
+    covariance = landmarks.covariance[rows[others], :3, :3]
     relative = estimate_relative_pose(
         camera,
         expected[others],
@@ -96,25 +93,57 @@ def find_second_motion(
     departure = views.measurement[agreeing, :2] - expected[agreeing, :2]
     apart = np.linalg.norm(departure, axis=1)
     nearer = stands_before(*(float(np.median(expected[chosen, 2])) for chosen in (agreeing, fit.inliers)))
-    stood_still = bool(np.median(window.landmarks.views[rows[agreeing]]) >= CONFIRMED)
     differs, many = not see_the_same(apart), len(agreeing) >= ACCEPTANCE.mover_points * MIN_POINTS
     is_rival = differs and share >= ACCEPTANCE.second_motion
     moves = moving is not None and nearer and (bool(moving) or (differs and many and share >= ACCEPTANCE.mover))
     if not (is_rival or moves):
         return None
     pose = fit.pose @ relative.T_key_camera
-    return SecondMotion(pose, agreeing, expected[agreeing], departure, share, nearer, stood_still)
+    is_mover = nearer and (share < ACCEPTANCE.second_motion or np.median(landmarks.views[rows[agreeing]]) < CONFIRMED)
+    return SecondMotion(fit, pose, agreeing, expected[agreeing], departure, is_mover)
+
+
+def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFit) -> SecondMotion | None:
+    """What moves before farther landmarks, and their pose; None where nearer ones agree with that.
+
+    Far parts hardly tell a translation: a body before them decides it, and all agree. The scores show it to first
+    order, at no cost; then the pose of the others is found.
+    """
+    window, views = localiser.window, matches.views
+    rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
+    disparity = window.landmarks.estimate[rows, 2]
+    for share in _NEAREST:
+        near = disparity > np.quantile(disparity[fit.inliers], 1.0 - share)
+        drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
+        pull = fit.scores[drawn].sum(axis=0)
+        if pull @ np.linalg.lstsq(rest.T @ rest, pull, rcond=1e-14)[0] < CHI_SQUARE_9999_OF_6:
+            continue
+        others = replace(matches, views=views.select(~near), probability=matches.probability[~near])
+        far = localiser.fit_near(others, prediction)
+        if far is None or not _contradicts(far, fit):
+            continue
+        by_fit, by_far = (seen_from(window, rows, each.pose) for each in (fit, far))
+        drawn &= np.isfinite(by_far[:, 0])
+        departure = views.measurement[:, :2] - by_far[:, :2]
+        moves = np.flatnonzero(drawn & ~are_one_place(np.linalg.norm(departure, axis=1)))
+        apart = np.linalg.norm((by_far - by_fit)[drawn, :2], axis=1)
+        if len(moves) >= MIN_POINTS and not see_the_same(apart):
+            far = replace(far, inliers=_among(np.flatnonzero(~near)[far.inliers], len(rows)))
+            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True)
+    return None
+
+
+def _contradicts(part: FrameFit, fit: FrameFit) -> bool:
+    """Whether the pose of a part of the matches departs from that of all by more than its own errors."""
+    common = part.joint.common[-6:] - fit.joint.common[-6:]
+    spread = max(part.nis_before_scaling, 1.0) * part.clustering * part.relative + common @ common.T
+    return Prediction(fit.pose, spread).excludes(part.pose)
 
 
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:
-    """(M,) bool, as much of the image as matches explain of which the median departs from a pose.
+    """(M,) bool, as much of the image (M cells) as some of `others` (K,) explain that depart (K pixels) in the median.
 
     Those are at most all that depart and, with them, as many that do not: of these the ones that explain the most.
-
-    Args:
-        cells: (M,) of all matches.
-        others: (K,) numbers of those that may agree.
-        departs: (K,) pixels from where the pose sees them.
     """
     share = 1.0 / np.bincount(cells)[cells[others]]
     same = are_one_place(departs)

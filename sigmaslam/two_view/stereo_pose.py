@@ -227,13 +227,7 @@ class _StereoMatches:
 
 
 def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: float) -> np.ndarray | None:
-    """Gauss-Newton on the stereo points with a robust loss whose scale shrinks from step to step.
-
-    Args:
-        matches: the points.
-        T_camera_key: (4, 4) start.
-        variance: scale of the variances, relative to the claimed ones.
-    """
+    """Gauss-Newton with a robust loss whose scale shrinks; variances are `variance` times the claimed ones."""
     scale = _FIRST_SCALE
     for _ in range(_STEPS):
         _, normal, gradient = matches.equations(T_camera_key, variance * scale**2)

@@ -1,13 +1,24 @@
-"""What matches that disagree with a pose can explain at most."""
+"""What matches that disagree with a pose can explain at most, and bodies that draw a pose along."""
 
 from itertools import combinations
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.frame_update import FrameUpdate
+from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.geometry.image_cells import explained_area
-from sigmaslam.slam.second_motion import _among, _most_departing
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, transform_points
+from sigmaslam.slam.guided_matching import GuidedMatches
+from sigmaslam.slam.localisation import Localiser
+from sigmaslam.slam.second_motion import SecondMotion, _among, _most_departing, find_scene_behind
 from sigmaslam.two_view.scene_pose import see_the_same
+from tests.support.dense_window import CAMERA, DEPTH, ITERATIONS, NO_WALK, make_window
+
+FAR, NEAR, POSE = 160, 50, se3_exp(np.array([0.02, 0.01, 0.02, 0.004, -0.003, 0.002]))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -28,3 +39,41 @@ def test_no_matches_that_depart_explain_more_than_the_bound(seed: int) -> None:
 
 def test_matches_that_stay_where_they_are_bound_nothing_else_in() -> None:
     assert not _most_departing(np.zeros(12, np.int64), np.arange(9), np.full(9, 1.0)).any()
+
+
+def drawn(seed: int, way: list[float]) -> tuple[FrameFit, SecondMotion | None]:
+    """The pose by a scene and a body before it that has gone some way, metres, and what is found to move."""
+    rng, count = np.random.default_rng(seed), FAR + NEAR
+    window = make_window(np.full(3, 1e-3))
+    window.add_keyframe(np.eye(4), np.eye(4), np.zeros((6, 6)), NO_WALK, DEPTH)
+    far = np.c_[rng.uniform([20.0, 20.0], [620.0, 460.0], (FAR, 2)), rng.uniform(8.0, 24.0, FAR)]
+    near = np.c_[rng.uniform([200.0, 150.0], [400.0, 330.0], (NEAR, 2)), rng.uniform(60.0, 70.0, NEAR)]
+    seen = np.concatenate([far, near])
+    window.add_landmarks(np.arange(count), seen, np.full((count, 4), 0.01))
+    window.solve()
+    points = CAMERA.triangulate(seen) + np.repeat([np.zeros(3), way], [FAR, NEAR], axis=0)
+    found = CAMERA.project(transform_points(se3_inverse(POSE), points)) + rng.normal(0.0, 0.3, (count, 3))
+    views = LandmarkViews(np.arange(count), found, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 2)))
+    motion: Any = SimpleNamespace(step=np.eye(4), step_covariance=np.diag(np.repeat([0.04, 0.01], 3)))
+    config: Any = SimpleNamespace(min_inliers=15)
+    given: list[Any] = [window, motion, FrameUpdate(window, ITERATIONS), None, None, None, config, None]
+    localiser, matches = Localiser(*given), GuidedMatches(views, np.ones(count), np.arange(count))
+    fit = localiser.update.fit(views, np.eye(4), motion.step_covariance, 15)
+    assert fit is not None
+    return fit, find_scene_behind(localiser, matches, fit)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_before_the_scene_that_draws_the_pose_along_is_found(seed: int) -> None:
+    """All agree with a pose between both motions."""
+    fit, second = drawn(seed, [-0.02, 0.0, 0.0])
+    assert second is not None
+    assert second.is_mover
+    assert np.mean(second.agreeing >= FAR) > 0.95
+    errors = [np.linalg.norm((se3_inverse(POSE) @ each.pose)[:3, 3]) for each in (fit, second.first)]
+    assert errors[1] < 0.2 * errors[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_at_rest_before_the_scene_is_none_that_moves(seed: int) -> None:
+    assert drawn(seed, [0.0, 0.0, 0.0])[1] is None
