@@ -11,7 +11,7 @@ class CalibrationSigmas:
     """Standard deviations of what is wrong with a calibration; relative, or angles in radians.
 
     The defaults are what calibrations of one rig differ by: KITTI's five days by 0.3 % in focal length and 0.2 px (0.3
-    mrad) in rows; its lengths are 0.5 to 1 % off (Cvisic et al. 2021), which a baseline has to answer for.
+    mrad) in rows; its lengths are 0.5 to 1 % off (Cvisic et al. 2021): a baseline is as uncertain as a focal length.
 
     Attributes:
         focal: focal length of both cameras, as a share of it.
@@ -24,7 +24,7 @@ class CalibrationSigmas:
 
     focal: float = 0.003
     principal_point: float = 0.002
-    baseline: float = 0.005
+    baseline: float = 0.003
     rotation: float = 0.0003
     distortion: float = 0.0005
 
@@ -46,7 +46,7 @@ class CalibrationSigmas:
             value = content.number("sigmas")
             if value != 0.0:
                 raise content.error(
-                    f"sigmas is {value:g}: give 0, or a mapping such as {{focal: 0.003, baseline: 0.005}}"
+                    f"sigmas is {value:g}: give 0, or a mapping such as {{focal: 0.003, baseline: 0.003}}"
                 )
             return cls.none()
         section, default = content.section("sigmas"), asdict(cls())
