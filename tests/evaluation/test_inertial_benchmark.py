@@ -60,7 +60,7 @@ def test_errors_drawn_from_the_covariance_have_a_nees_of_one(good, walk):
         error = root @ rng.standard_normal(25)
         others = np.concatenate(vectors) - error[6:]
         motion = MotionState(se3_exp(-error[:6]) @ step, others, root @ root.T)
-        frame = dark_runs._Tracked("inertial", poses[FRAME], KEYFRAME, motion, True, 0.0)
+        frame = dark_runs._Tracked("inertial", poses[FRAME], np.eye(6), KEYFRAME, motion, True, 0.0)
         for name, value in dark_runs._state_errors(frame, good, FRAME).items():
             found.setdefault(name, []).append(value)
         sigmas, nees = dark_runs._pose_sigmas(frame, good, FRAME)
@@ -117,12 +117,16 @@ def test_a_run_is_judged_after_each_while_in_the_dark_and_what_follows_at_its_en
         step = np.linalg.inv(poses[5]) @ pose
         motion = MotionState(step, np.zeros(19), np.diag(SIGMA**2))
         status = "inertial" if k in dark else "tracking"
-        tracked.append(dark_runs._Tracked(status, pose @ away, 5, motion, False, 0.1))
+        tracked.append(dark_runs._Tracked(status, pose @ away, (5e-3) ** 2 * np.eye(6), 5, motion, False, 0.1))
     half, whole = (dark_runs._judge(tracked, good, range(10, stop), stop == 20) for stop in (15, 20))
     assert [half.dark, half.inertial, whole.dark] == [5, 5, 10]
     assert [half.end_metres, whole.end_metres] == pytest.approx([5e-3, 10e-3])
     assert np.isnan([half.back, half.after_metres]).all()
     assert [whole.back, whole.after_metres] == pytest.approx([0, 10e-3])
+    # With images the published poses are judged: right to frame 9, two sigmas off from frame 20 on.
+    light = dark_runs._judge(tracked, good, range(0), is_last=True)
+    share = (len(poses) - 20) / (len(poses) - 11)
+    assert [light.nees, light.place_nees] == pytest.approx([4.0 / 6.0 * share, 4.0 / 3.0 * share])
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam.slam.tracker import StereoTracker
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, blacken, interval
+from sigmaslam_benchmarks.live.judge import DrivenPose, pose_errors
 from sigmaslam_benchmarks.live.recordings import GoodFrames
 from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error
 from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covariance
@@ -61,7 +62,7 @@ class DarkResult:
         end_sigmas: length of the last dark frame's position error under the covariance of its pose since the keyframe.
         after_metres: error of the motion from the last frame before the dark to the first one that is back.
         nees, place_nees: of the pose since the keyframe and of its position per degree of freedom, mean over the dark;
-            without dark over all frames.
+            without dark of the pose that is published, mean over the frames that are tracked.
         states: NEES per degree of freedom of `STATES`, likewise; empty without an inertial sensor or its truth.
         tilt, tilt_sigma: error of gravity's direction and its standard deviation, degrees, at the end.
         ate: root mean square position error of all frames, metres.
@@ -95,6 +96,7 @@ class _Tracked:
     Attributes:
         status: as it is called.
         pose: (4, 4) T_world_camera.
+        covariance: (6, 6) of it, in the camera's own frame.
         keyframe: number of the frame that `motion` begins at; -1: there is none.
         motion: pose since the keyframe and what else is known.
         is_inertial: the sensor is in use.
@@ -103,6 +105,7 @@ class _Tracked:
 
     status: str
     pose: np.ndarray
+    covariance: np.ndarray
     keyframe: int
     motion: MotionState
     is_inertial: bool
@@ -134,10 +137,12 @@ def _judge(tracked: Sequence[_Tracked], good: GoodFrames, dark: range, is_last: 
     statuses, missing = [each.status for each in tracked], float("nan")
     judged = dark if len(dark) else range(1, len(tracked))
     states = [_state_errors(tracked[k], good, k) for k in judged]
-    errors = [_pose_sigmas(tracked[k], good, k) for k in judged]
     lost, end, after, lost_after, back = ("lost", "starting"), np.full(6, np.nan), missing, missing, missing
     if len(dark):
         end = _motion_error(tracked, good, dark.start - 1, dark.stop - 1)
+        errors = [_pose_sigmas(tracked[k], good, k) for k in dark]
+    else:
+        errors = _published_sigmas(tracked, good)
     if is_last:
         lost_after = sum(status in lost for status in statuses[dark.stop :]) if len(dark) else statuses.count("lost")
         kinds = (*lost, "inertial", "skipped")
@@ -184,7 +189,8 @@ def _track(frames: Sequence[DrivenFrame], good: GoodFrames, imu: InertialRecordi
             keyframe = number
         # No result has velocity, gravity and biases: they are the filter's own.
         motion = tracker._motion
-        yield _Tracked(estimate.status, estimate.T_world_camera, keyframe, motion.state, motion.is_inertial, cpu)
+        pose, covariance = estimate.T_world_camera, estimate.covariance
+        yield _Tracked(estimate.status, pose, covariance, keyframe, motion.state, motion.is_inertial, cpu)
 
 
 def _motion_error(tracked: Sequence[_Tracked], good: GoodFrames, first: int, last: int) -> np.ndarray:
@@ -205,6 +211,14 @@ def _pose_sigmas(frame: _Tracked, good: GoodFrames, number: int) -> tuple[float,
     claimed = claimed + relative_truth_covariance(true[None], spread, spread)[0]
     position = squared_mahalanobis(error[:3], claimed[:3, :3])
     return float(np.sqrt(position)), float(squared_mahalanobis(error, claimed)) / 6.0
+
+
+def _published_sigmas(tracked: Sequence[_Tracked], good: GoodFrames) -> list[tuple[float, float]]:
+    """`_pose_sigmas` of the published poses, relative to the start, of the frames called `tracking`."""
+    poses = [DrivenPose(k, each.status, each.pose, each.covariance) for k, each in enumerate(tracked)]
+    errors = pose_errors(poses, good.truth)
+    rows = [k for k, each in enumerate(tracked) if each.status == "tracking"]
+    return list(zip(errors.sigmas[rows].tolist(), (errors.pose[rows] / 6.0).tolist(), strict=True))
 
 
 def _state_errors(frame: _Tracked, good: GoodFrames, number: int) -> dict[str, float]:
