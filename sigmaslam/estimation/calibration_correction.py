@@ -53,6 +53,7 @@ def judge_calibration(window: KeyframeWindow) -> None:
             _set_error(window, ERRORS.index("baseline"), 0.0, 0.0)
     elif held is not None and (window.board_disparity is None or window.held_offset != before):
         _move_baseline(window, held - float(window.expected[0]))
+    window.worse = window.evidence.worse_by(window.causes)
 
 
 def _correct_calibration(window: KeyframeWindow) -> None:

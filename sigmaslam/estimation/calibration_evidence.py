@@ -10,6 +10,10 @@ is wrong" is a ratio of Savage and Dickey in closed form (Dickey 1971; Bishop 20
 
 and what it makes of all errors is N(P' y, P') with P'^-1 = L + (S + s^2 w w^T)^-1. No view is linearised again.
 Neighbours err alike, and so do textures followed anew: for the variances of what is found L is divided by a factor.
+
+A calibration that is worse than usual is so in many errors at once: of the factors by which all their standard
+deviations may be larger, beside the hypotheses, the one of the largest marginal likelihood is taken (empirical Bayes,
+"type 2 maximum likelihood": Bishop 2006, section 3.5). Where the usual ones suffice it is one.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, CalibrationPrior
 from sigmaslam.estimation.state_layout import CALIBRATION
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.inference.onnx_graph import Step
@@ -30,6 +34,7 @@ _SIZE = 0.01
 # A file may claim that a calibration has no errors at all, as a share of the focal length.
 _LEAST_SIGMA = 1e-6
 _ALIKE = 8.0  # of streets, seeds 301 to 304, 700 to 704, 711 and 712
+_WORSE = np.geomspace(1.0, 8.0, 13)
 HYPOTHESES = {
     "offset": ("offset",),  # a principal point
     "yaw": ("offset", "yaw"),
@@ -72,6 +77,7 @@ class CalibrationEvidence:
     ) -> None:
         units = np.where(np.isin(ERRORS, ("focal", "baseline")), 1.0, focal_length)
         self._sigma = np.maximum(usual.sigma, _LEAST_SIGMA * units)
+        self._is_uncertain = usual.sigma > 0.0
         self._size = _SIZE * focal_length
         self._condition = condition
         self.expected = np.zeros(len(ERRORS)) if expected is None else expected.copy()
@@ -125,3 +131,23 @@ class CalibrationEvidence:
         weights = {name: _PRIOR * np.exp(ratio - top) for name, (ratio, _, _) in found.items()}
         total = (1.0 - _PRIOR * len(found)) * np.exp(-top) + sum(weights.values())
         return {k: Cause(odds / total, *found[k][1:]) for k, odds in weights.items() if odds > _HOPELESS * total}
+
+    def worse_by(self, causes: dict[str, Cause]) -> float:
+        """By what factor errors of the pair, but the offset, are larger than usual beside these causes; 1 or more."""
+        identity, sigma = np.eye(len(ERRORS)), self._sigma
+        information = np.linalg.inv(self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(sigma, sigma))
+        vector = information @ ((self._posterior.calibration - self.expected) / sigma) / _ALIKE
+        information = (information - identity) / _ALIKE
+        spreads = [
+            np.sqrt(cause.probability) * self._size * np.isin(ERRORS, HYPOTHESES[name]) / sigma
+            for name, cause in causes.items()
+        ]
+        beside = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
+        grows = np.isin(ERRORS, OF_PAIR[1:]) & self._is_uncertain
+        likelihoods = []
+        for factor in _WORSE:
+            prior = np.diag(np.where(grows, factor**2, 1.0)) + beside
+            seen = identity + prior @ information
+            squared = vector @ np.linalg.solve(seen, prior @ vector)
+            likelihoods.append(squared - np.linalg.slogdet(seen)[1])
+        return float(_WORSE[int(np.argmax(likelihoods))])

@@ -46,6 +46,10 @@ class WindowState:
         """(n, n) covariance with the part of the considered errors."""
         return np.asarray(self.covariance + self.common @ self.common.T)
 
+    def with_larger_errors(self, growth: np.ndarray) -> WindowState:
+        """The same where considered errors are larger by factors (15,)."""
+        return replace(self, common=self.common * growth, past=replace(self.past, common=self.past.common * growth))
+
     @property
     def all_poses(self) -> PastPoses:
         """The marginalised poses, and behind them those of the window."""

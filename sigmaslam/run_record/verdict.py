@@ -106,7 +106,7 @@ def times_verdict(summary: dict[str, Any]) -> str | None:
 def calibration_verdict(
     calibration: CalibrationEstimate, frames: int, points: int, expected: float, findings: Sequence[Finding] = ()
 ) -> str:
-    """The estimated disparity offset, and what a check found about the rig, in words.
+    """The estimated disparity offset, what a check found about the rig, and how much worse it is than given, in words.
 
     One sequence gets the same verdict at any length, or that it is too early to say: an offset counts as wrong where it
     is more than three standard deviations of calibrations of one rig, as it wanders by about one within a drive.
@@ -118,6 +118,17 @@ def calibration_verdict(
         expected: as of `expected_offset`.
         findings: of a check of the input.
     """
+    words = _main_verdict(calibration, frames, points, expected, findings)
+    if calibration.worse > 1.0:
+        words += f" Beside this, lenses, turns and focal length seem about {calibration.worse:.1f} times as far off as "
+        words += "the calibration's sigmas say: the covariances hold that."
+    return words
+
+
+def _main_verdict(
+    calibration: CalibrationEstimate, frames: int, points: int, expected: float, findings: Sequence[Finding]
+) -> str:
+    """`calibration_verdict`, but for the size of errors that are not estimated."""
     faults = wrong(findings)
     delays = [each.message for each in faults if each.name == "synchronisation"]
     if delays:

@@ -24,12 +24,15 @@ class CalibrationEstimate:
             names: value and standard deviation, in the units of `sigmaslam.estimation.calibration_errors.ERRORS`.
         causes: what is wrong by the evidence, by the names of `sigmaslam.estimation.calibration_evidence.HYPOTHESES`:
             its probability, above a half; its error and standard deviation, as shares of the focal length.
+        worse: factor by which errors that are not estimated are larger than the calibration's sigmas say, as far as
+            images show; covariances hold it. 1 where the sigmas suffice.
     """
 
     disparity_offset: float
     disparity_offset_sigma: float
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)
     causes: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    worse: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -146,7 +146,7 @@ class FrameHistory:
             self._links.append(link)
         for gone in [each for each in self._chain if each not in ids]:
             self._forget(gone, ids)
-        self._ids, self._state = ids, self._window.posterior
+        self._ids, self._state = ids, self._window.published
         self._timestamps.append(estimate.timestamp)
 
     def final(self) -> tuple[Trajectory, np.ndarray]:

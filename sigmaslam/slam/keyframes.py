@@ -151,7 +151,7 @@ class Keyframes:
         """All landmarks so far that were seen at least three times, in the world of the window."""
         for anchor, keyframe in enumerate(self.active):
             keyframe.measure_surfaces(self._window.landmarks, anchor)
-        past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.posterior.past)
+        past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.published.past)
         points = window_points(self._window, _times(self.active))
         for keyframe in self.active:
             points = points.shade(keyframe.view.left, keyframe.timestamp)
@@ -174,7 +174,7 @@ class Keyframes:
     def pack(self, frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
         """All of them as arrays by name, by which a later run finds its place in the map."""
         keyframes = [*self.remembered, *self.active]
-        return pack_keyframes(keyframes, self._window.posterior.all_poses, frontend, camera, self.hanging.values())
+        return pack_keyframes(keyframes, self._window.published.all_poses, frontend, camera, self.hanging.values())
 
     def _remember(self, keyframes: list[Keyframe], spare: KnownKeyframe | None = None) -> None:
         """Takes keyframes of the window's past, and hangs superfluous ones at others, but not the one to spare."""

@@ -123,7 +123,7 @@ def _triangulate(
     window: KeyframeWindow, chosen: np.ndarray, keyframe_times: np.ndarray, min_views: int, absolute: bool
 ) -> PointMap:
     """Points in the world; their covariances with that of the anchor's pose, or given it."""
-    landmarks, state = window.landmarks, window.posterior
+    landmarks, state = window.landmarks, window.published
     uvd = window.as_calibrated(landmarks.estimate)
     kept = chosen & (landmarks.views >= min_views) & (uvd[:, 2] > _MIN_DISPARITY)
     uvd, landmarks = uvd[kept], landmarks.select(kept)

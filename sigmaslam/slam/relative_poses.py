@@ -7,7 +7,7 @@ between the two, which is forgotten when the next frame comes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,7 +76,7 @@ class RelativePoseReporter:
             timestamp: of the frame, seconds.
             fit: its fit to the window; None: the last keyframe moved on, be it the frame itself or a prediction.
         """
-        state = self._window.posterior
+        state = self._window.published
         if not len(state):
             return RelativePoses.empty()
         self._note_keyframes()
@@ -91,7 +91,8 @@ class RelativePoseReporter:
             earlier, covariance = last_relative_to(state, index)
             covariance = covariance + prediction.covariance
         else:
-            earlier, covariance = frame_relative_to(state, fit.joint, index)
+            joint = replace(fit.joint, common=fit.joint.common * self._window.considered_growth)
+            earlier, covariance = frame_relative_to(state, joint, index)
             # What the fit was inflated by is the frame's alone.
             covariance = covariance + (fit.covariance - fit.joint.covariance[-6:, -6:])
         T_left_rectified = se3_inverse(self._T_rectified_left)

@@ -51,14 +51,14 @@ class Reporter:
         doubts: Doubts,
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
-        state = self.window.posterior
+        state = self.window.published
         if not len(state):
             return self._report_nothing(timestamp, status, milliseconds)
         if fit is not None:
             # Published alone: a prediction as wide as that would find nothing.
             fit = fit.spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            by_error, offset = fit.joint.common[-6:], float(fit.calibration[0])
+            by_error, offset = fit.joint.common[-6:] * self.window.considered_growth, float(fit.calibration[0])
             covariance, part = fit.joint.covariance, slice(-6, None)
         else:
             prediction = Prediction.of(self.window, self.motion)
@@ -119,10 +119,11 @@ class Reporter:
 
     def _describe_calibration(self, fit: FrameFit | None) -> CalibrationEstimate:
         """As the last keyframe has it, as a frame's own is forgotten; before the second one as the frame has it."""
-        state = self.window.posterior
+        state = self.window.published
         errors, covariance, common = state.calibration, state.covariance, state.common
         if fit is not None and self.window.held_offset.value is None:
-            errors, covariance, common = fit.calibration, fit.joint.covariance, fit.joint.common
+            errors, covariance = fit.calibration, fit.joint.covariance
+            common = fit.joint.common * self.window.considered_growth
         common = common[CALIBRATION]
         sigma = np.sqrt(np.maximum(np.diag(covariance[CALIBRATION, CALIBRATION] + common @ common.T), 0.0))
         chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]
@@ -133,7 +134,7 @@ class Reporter:
         others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
         focal = self.window.camera.fx
         shares = {k: (c.probability, c.mean / focal, float(np.sqrt(c.variance)) / focal) for k, c in causes.items()}
-        return CalibrationEstimate(float(errors[0]), float(sigma[0]), others, shares)
+        return CalibrationEstimate(float(errors[0]), float(sigma[0]), others, shares, self.window.worse)
 
 
 def _within_half_turn(covariance: np.ndarray) -> np.ndarray:

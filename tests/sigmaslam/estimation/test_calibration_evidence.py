@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from sigmaslam.estimation.calibration_correction import change_rig
-from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPrior
-from sigmaslam.estimation.calibration_evidence import _ALIKE, HYPOTHESES, CalibrationEvidence, Cause
+from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, TURNS, CalibrationPrior
+from sigmaslam.estimation.calibration_evidence import _ALIKE, _WORSE, HYPOTHESES, CalibrationEvidence, Cause
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.inference.backends import load_step
@@ -115,3 +115,31 @@ def test_a_bump_may_have_turned_the_camera_whatever_its_file_claims(sigma: float
     after = window.posterior.common
     np.testing.assert_allclose(np.diag(after @ after.T - before @ before.T)[turns], 4.0)
     np.testing.assert_allclose(np.diag(window.calibration.covariance - covariance)[turns], 4.0)
+
+
+@pytest.mark.parametrize("worse", [1.0, 4.0])
+def test_errors_of_a_bad_calibration_are_as_much_larger_as_their_likelihood_says(worse: float):
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        slopes = 3.0 * rng.normal(size=(COUNT, len(ERRORS)))
+        # What views say counts an eighth, as those of an eighth of their information would.
+        loud = np.sqrt(_ALIKE) * NOISE
+        grows = np.isin(ERRORS, OF_PAIR[1:])
+        measured = slopes @ (rng.normal(size=len(ERRORS)) * USUAL.sigma * np.where(grows, worse, 1.0))
+        measured += loud * rng.normal(size=COUNT)
+        evidence = CalibrationEvidence(USUAL, CAMERA.fx, load_step("window_condition"))
+        evidence.learn(WindowState.initial(USUAL), slopes.T @ slopes / NOISE**2, slopes.T @ measured / NOISE**2)
+        densities = [
+            multivariate_normal(
+                np.zeros(COUNT),
+                slopes @ np.diag(np.where(grows, each**2, 1.0) * USUAL.sigma**2) @ slopes.T + loud**2 * np.eye(COUNT),
+            ).logpdf(measured)
+            for each in _WORSE
+        ]
+        found.append(evidence.worse_by({}))
+        assert found[-1] == _WORSE[np.argmax(densities)]
+    assert np.median(found) == pytest.approx(worse, rel=0.25)
+    # A file that claims to be exact leaves nothing to be larger.
+    exact = CalibrationPrior.of(CAMERA, CalibrationSigmas.none(), 0.5)
+    assert CalibrationEvidence(exact, CAMERA.fx, load_step("window_condition")).worse_by({}) == 1.0

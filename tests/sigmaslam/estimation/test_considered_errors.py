@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, CalibrationPrior
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
@@ -303,3 +303,17 @@ def without_errors(solution: Solution) -> Solution:
     past = replace(state.past, common=np.zeros_like(state.past.common))
     window.posterior = replace(state, common=np.zeros_like(state.common), past=past)
     return Solution(window, replace(solution.fit, joint=replace(joint, common=np.zeros_like(joint.common))))
+
+
+def test_what_is_published_of_a_bad_calibration_is_as_if_its_sigmas_had_been_larger():
+    growth = np.where(np.isin(NAMES, OF_PAIR), 3.0, 1.0)
+    given, larger = (moving_on(GIVEN, sigma).window for sigma in (SIGMA, growth * SIGMA))
+    given.worse, larger.worse = 3.0, 1.0
+    for found, wanted in (
+        (given.published.whole_covariance, larger.posterior.whole_covariance),
+        (given.published.past.whole_covariance, larger.posterior.past.whole_covariance),
+    ):
+        scale = np.sqrt(np.diag(wanted))
+        np.testing.assert_allclose(found / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=1e-4)
+    assert np.array_equal(given.published.poses, given.posterior.poses)
+    assert np.trace(given.published.whole_covariance) > 1.5 * np.trace(given.posterior.whole_covariance)

@@ -51,6 +51,13 @@ def test_a_calibration_without_errors_leaves_the_estimate_alone():
     assert "nothing wrong" in calibration_verdict(CalibrationEstimate(0.09, 0.01), 100, 1000, 0.0)
 
 
+def test_a_calibration_that_is_worse_than_its_sigmas_is_told_of():
+    good, bad = (calibration_verdict(CalibrationEstimate(0.0, 0.03, worse=worse), 100, 1000, 0.1) for worse in (1, 2.8))
+    assert "times as far off" not in good
+    assert bad.startswith(good)
+    assert "about 2.8 times as far off" in bad
+
+
 def test_a_large_offset_is_named_however_uncertain_its_scale_makes_it():
     assert "off by +3.40 ± 0.4" in verdict(3.4, 0.4)
     assert (
