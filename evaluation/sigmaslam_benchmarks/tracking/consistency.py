@@ -1,6 +1,5 @@
 """Whether poses and map are as sure as they say, and whether covariances of matches pay: renders with exact truth."""
 
-import json
 import os
 from collections.abc import Callable
 from contextlib import redirect_stderr
@@ -18,14 +17,13 @@ from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
-from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered
+from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered, read_simulation
 from sigmaslam_benchmarks.tracking.consistency_page import DRAWN, ConsistencyResult, Scale, format_noise, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Trial, track_ours
 from sigmaslam_evaluation.metrics import map_consistency as consistency
 from sigmaslam_evaluation.truth_conventions import find_truth
-from sigmaslam_synthetic.render_sequence import SCENE_NAME
-from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
+from sigmaslam_synthetic.simulation import Recipe, Studio
 
 # The images of all three are rectified, so that the injected offset shifts all disparities alike.
 SCALES = (
@@ -98,8 +96,7 @@ def _hash_code() -> str:
 @lru_cache(maxsize=1)
 def _open_scene(source: Path) -> Studio:
     """Of a sequence, whose methods are judged one after another."""
-    content = json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))
-    return Studio(Simulation.from_json(content["simulation"]))
+    return Studio(read_simulation(source))
 
 
 def depths_around(studio: Studio, frame: int, pixels: np.ndarray) -> np.ndarray:

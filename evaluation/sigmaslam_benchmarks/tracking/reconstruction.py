@@ -1,6 +1,5 @@
 """Dense reconstruction on renders with exact depth: errors, their intervals, completeness, ghosts of moving bodies."""
 
-import json
 import os
 import tempfile
 from collections.abc import Callable
@@ -18,14 +17,13 @@ from sigmaslam.reconstruction.recorded_keyframes import open_input, read_recorde
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_code
-from sigmaslam_benchmarks.rendered_camera import open_rendered
+from sigmaslam_benchmarks.rendered_camera import open_rendered, read_simulation
 from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
 from sigmaslam_benchmarks.tracking.real_disparity import write_real
 from sigmaslam_benchmarks.tracking.reconstruction_page import ReconstructedSequence, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import track_ours
-from sigmaslam_synthetic.render_sequence import SCENE_NAME
-from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
+from sigmaslam_synthetic.simulation import Recipe, Studio
 
 SIZES = {"street": (576, 176), "room": (360, 270), "organ": (360, 288)}
 """Worlds, and the size of their images: those of the benchmark `consistency`, whose renders may be copied."""
@@ -91,8 +89,7 @@ def recipe(world: str, seed: int) -> Recipe:
 
 def judge_reconstruction(source: Path) -> DepthFigures:
     """Tracks a rendered folder, fuses the depths of its keyframes and holds them against the exact ones."""
-    content = json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))
-    simulation = Simulation.from_json(content["simulation"])
+    simulation = read_simulation(source)
     studio = Studio(simulation, device="cpu")
     moving = np.array([body.path is not None for body in simulation.scene.bodies] + [False])
     with tempfile.TemporaryDirectory() as scratch:
