@@ -4,7 +4,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from functools import cache
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,7 @@ from sigmaslam.reconstruction.disparity import semi_global_disparity
 from sigmaslam.reconstruction.reconstruct import fuse_keyframes
 from sigmaslam.reconstruction.recorded_keyframes import open_input, read_recorded_keyframes
 from sigmaslam.runs.request import TrackerOptions
-from sigmaslam.slam.config import TrackerConfig
-from sigmaslam_benchmarks.code_hash import hash_code
+from sigmaslam_benchmarks.code_hash import hash_once
 from sigmaslam_benchmarks.rendered_camera import open_rendered, read_simulation
 from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
 from sigmaslam_benchmarks.tracking.real_disparity import write_real
@@ -70,14 +69,9 @@ def write_reconstruction(
         ]
         return format_page(found, seeds, command, missing)
 
-    kind = TrialKind({_METHOD: TrackerConfig()}, _judge, _hash_code)
+    kind = TrialKind([_METHOD], _judge, partial(hash_once, Path(__file__)))
     recipes = [recipe(world, FIRST_SEED + k) for k in range(seeds) for world in SIZES]
     return write_trials(path, runs, kind, recipes, form, workers, ray, note)
-
-
-@cache
-def _hash_code() -> str:
-    return hash_code(Path(__file__))
 
 
 def recipe(world: str, seed: int) -> Recipe:

@@ -4,15 +4,14 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
-from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam_benchmarks.code_hash import hash_code
+from sigmaslam_benchmarks.code_hash import hash_once
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.claimed_errors import motion_errors
 from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, read_image_motion
@@ -62,7 +61,7 @@ def write_shake(
         }
         return format_page(results, FRAMES, (_FIRST_SEED, seeds), command, missing)
 
-    kind = TrialKind(dict.fromkeys([_MOTION, *METHODS], TrackerConfig()), _judge, _hash_code)
+    kind = TrialKind([_MOTION, *METHODS], _judge, partial(hash_once, Path(__file__)))
     recipes = [recipe(k, _FIRST_SEED) for k in range(seeds)]
     return write_trials(path, runs, kind, recipes, form, workers, ray, note)
 
@@ -72,11 +71,6 @@ def _describe(trials: SequenceTrials) -> ShakenSequence:
     recipe, preset = trials.recipe, PRESETS[trials.recipe.preset]
     size = (recipe.width or preset.width, recipe.height or preset.height)
     return ShakenSequence(recipe.name, size, recipe.movers, ImageMotion(**trials.read(_MOTION) or {}))
-
-
-@cache
-def _hash_code() -> str:
-    return hash_code(Path(__file__))
 
 
 def recipe(number: int, first_seed: int) -> Recipe:
