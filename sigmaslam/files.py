@@ -1,9 +1,11 @@
 """Files that appear whole or not at all."""
 
+import csv
+import io
 import os
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -55,6 +57,13 @@ def left_behind(folder: Path) -> list[Path]:
 def printable(name: str | Path) -> str:
     """A name that can be written as UTF-8: bytes of a path that are none become `\\udc..`."""
     return str(name).encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    """Rows as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def make_folder(path: Path) -> None:

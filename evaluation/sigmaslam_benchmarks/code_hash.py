@@ -20,9 +20,15 @@ def hash_code(*modules: Path) -> str:
 
 
 @cache
+def hash_once(*modules: Path) -> str:
+    """As `hash_code`; of the process, which keeps its code."""
+    return hash_code(*modules)
+
+
+@cache
 def hash_renderer() -> str:
     """Hash of all code that the images and the truth of a recipe depend on; of the process, which keeps its code."""
-    return _hash(code_files(_file_of("sigmaslam_synthetic.render_sequence")))
+    return _hash(code_files(*_files_of(("sigmaslam_synthetic", "render_sequence"))))
 
 
 def code_files(*modules: Path) -> list[Path]:
@@ -75,7 +81,3 @@ def _files_of(parts: tuple[str, ...]) -> list[Path]:
         return []
     base = Path(spec.origin).resolve().parent.joinpath(*parts[1:])
     return [path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()]
-
-
-def _file_of(module: str) -> Path:
-    return _files_of(tuple(module.split(".")))[0]

@@ -1,7 +1,11 @@
-"""Rendered sequences, whose calibration is known exactly, and calibrations with errors for them."""
+"""Rendered sequences, whose world and calibration are known exactly, and calibrations with errors for them."""
 
+from __future__ import annotations
+
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +13,17 @@ from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.readers import StereoSequence, open_sequence
+
+if TYPE_CHECKING:
+    from sigmaslam_synthetic.simulation import Simulation
+
+
+def read_simulation(source: Path) -> Simulation:
+    """What a rendered sequence was made of."""
+    from sigmaslam_synthetic.render_sequence import SCENE_NAME
+    from sigmaslam_synthetic.simulation import Simulation
+
+    return Simulation.from_json(json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))["simulation"])
 
 
 def open_rendered(source: Path) -> StereoSequence:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,6 @@ from sigmaslam_evaluation.evaluation_result import Evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 
 if TYPE_CHECKING:
-    from sigmaslam.slam.tracker import TrackerConfig
     from sigmaslam_synthetic.simulation import Recipe
 
 
@@ -165,42 +164,22 @@ def render(folder: Path, recipe: Recipe, workers: int, done: Callable[[int], Non
     return source
 
 
-@dataclass(frozen=True, slots=True)
-class TrialCache:
-    """Figures of trials as JSON files, used again while recipe, configuration and code are the same.
+def read_figures(path: Path, made_from: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Figures that `write_figures` kept; None where there are none, or of something else.
 
-    Attributes:
-        folder: of the files.
-        code: hash of the code, see `hash_code`.
+    Raises:
+        InputError: the file is no such one.
     """
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path} is no result of this benchmark ({error}): remove it") from error
+    asked = json.loads(json.dumps(made_from))
+    return dict(content["result"]) if content.get("made_from") == asked else None
 
-    folder: Path
-    code: str
 
-    def read(self, recipe: Recipe, method: str, config: TrackerConfig) -> dict[str, Any] | None:
-        """The figures of a method on a rendered sequence; None where there are none, or of something else.
-
-        Raises:
-            InputError: the file is not of this cache.
-        """
-        path = self._path(recipe, method)
-        if not path.is_file():
-            return None
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError(f"{path} is no result of this benchmark ({error}): remove it") from error
-        asked = json.loads(json.dumps(self._made_from(recipe, config)))
-        return dict(content["result"]) if content.get("made_from") == asked else None
-
-    def write(self, recipe: Recipe, method: str, config: TrackerConfig, figures: dict[str, Any]) -> None:
-        """Keeps the figures of a method on a rendered sequence."""
-        content = {"made_from": self._made_from(recipe, config), "result": figures}
-        atomic_write_text(self._path(recipe, method), json.dumps(content, indent=1) + "\n")
-
-    def _path(self, recipe: Recipe, method: str) -> Path:
-        slug = "".join(letter if letter.isalnum() else "_" for letter in method)
-        return self.folder / f"{recipe.name}-{slug}.json"
-
-    def _made_from(self, recipe: Recipe, config: TrackerConfig) -> dict[str, Any]:
-        return {"recipe": asdict(recipe), "configuration": asdict(config), "code": self.code}
+def write_figures(path: Path, made_from: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
+    """Keeps figures as JSON, with what they are made from: they are used again while that is the same."""
+    atomic_write_text(path, json.dumps({"made_from": made_from, "result": figures}, indent=1) + "\n")

@@ -13,10 +13,10 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
-from sigmaslam.plot_style import BLUE, GREY, has_matplotlib, style_axes
+from sigmaslam.plot_style import BLUE, GREY, has_matplotlib
 from sigmaslam.report.figures import save_png
 from sigmaslam_filters import SO3, Gaussian, degree_of_belief
-from sigmaslam_localisation.localisation_page import write_page
+from sigmaslam_localisation.localisation_page import draw_axes, write_page
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
 from sigmaslam_localisation.output import write_lines
 from sigmaslam_localisation.starry import StereoRecording
@@ -185,30 +185,20 @@ def _lines(name: str, estimate: BodyEstimate) -> Iterable[str]:
 def _draw(recording: StereoRecording, estimate: BodyEstimate, png: Path) -> list[tuple[str, str, Figure]]:
     if not has_matplotlib():
         return []
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 6), layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = draw_axes(6, "x [m]", "y [m]")
     if estimate.truth is not None:
         axes.plot(*estimate.truth[:, :2].T, color=GREY, lw=0.6)
     axes.plot(*estimate.pose[:, :2].T, color=BLUE, lw=1.0)
     axes.plot(*recording.points[:, :2].T, "x", ms=6, color=GREY)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    style_axes(axes)
     save_png(figure, png)
     drawn = [("Map", "From above; points are crosses, the truth is thin and grey.", figure)]
-    figure = Figure(figsize=(8, 2.6), layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = draw_axes(2.6, "time [s]", "sigma [m]")
     deviation = np.sqrt(np.diagonal(estimate.covariance, axis1=1, axis2=2))
     seconds = estimate.seconds - estimate.seconds[0]
     for index, label in enumerate(("x", "y", "z")):
         axes.plot(seconds, deviation[:, index], lw=1.0, label=label)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("sigma [m]")
     axes.set_yscale("log")
     axes.legend(fontsize=8)
-    style_axes(axes)
     drawn.append(("Claimed uncertainty", "Standard deviations along the axes of the body.", figure))
     return drawn

@@ -63,14 +63,11 @@ def draw_robots(estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: 
     """The map, also as a PNG, and innovations over time; nothing without matplotlib."""
     if not has_matplotlib():
         return []
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 6), layout="constrained")
-    _draw_map(figure, estimates, landmarks)
+    figure, axes = draw_axes(6, "x [m]", "y [m]")
+    _draw_map(axes, estimates, landmarks)
     save_png(figure, png)
     drawn = [("Map", f"Ellipses of {SIGMAS:g} sigma; landmarks are crosses, the truth is thin and grey.", figure)]
-    figure = Figure(figsize=(8, 2.6), layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = draw_axes(2.6, "time [s]", "NIS / dof")
     for estimate, colour in zip(estimates, _colours(estimates), strict=True):
         row, slot = np.nonzero(np.isfinite(estimate.nis))
         ratio = estimate.nis[row, slot] / estimate.innovation.shape[-1]
@@ -78,24 +75,28 @@ def draw_robots(estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: 
         axes.plot(seconds, ratio, ".", ms=1.5, color=colour, label=estimate.name, rasterized=True)
     axes.axhline(1.0, color=GREEN, lw=1)
     axes.set_yscale("log")
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("NIS / dof")
-    style_axes(axes)
     drawn.append(("Normalised innovation squared", "Of each sighting, per degree of freedom.", figure))
-    figure = Figure(figsize=(8, 2.6), layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = draw_axes(2.6, "time [s]", "belief")
     for estimate, colour in zip(estimates, _colours(estimates), strict=True):
         axes.plot(estimate.seconds - estimate.seconds[0], estimate.belief, color=colour, lw=1.0, rasterized=True)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("belief")
     axes.set_ylim(-0.03, 1.03)
-    style_axes(axes)
     drawn.append(("Belief", "One minus the largest standard deviation of the position in metres.", figure))
     return drawn
 
 
-def _draw_map(figure: Figure, estimates: Sequence[RobotEstimate], landmarks: np.ndarray) -> None:
+def draw_axes(height: float, x: str, y: str) -> tuple[Figure, Axes]:
+    """A figure of eight inches and so many, and its axes with these labels."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, height), layout="constrained")
     axes = figure.add_subplot()
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    style_axes(axes)
+    return figure, axes
+
+
+def _draw_map(axes: Axes, estimates: Sequence[RobotEstimate], landmarks: np.ndarray) -> None:
     for estimate, colour in zip(estimates, _colours(estimates), strict=True):
         if estimate.truth is not None:
             axes.plot(*estimate.truth.poses[:, :2].T, color=GREY, lw=0.5, rasterized=True)
@@ -111,10 +112,7 @@ def _draw_map(figure: Figure, estimates: Sequence[RobotEstimate], landmarks: np.
                 )
     axes.plot(*landmarks.T, "x", ms=7, mew=1.6, color=GREY)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
     axes.legend(loc="best", fontsize=8)
-    style_axes(axes)
 
 
 def _draw_ellipse(axes: Axes, centre: np.ndarray, covariance: np.ndarray, colour: str) -> None:

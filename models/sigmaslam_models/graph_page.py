@@ -1,7 +1,5 @@
 """The page of the graphs that ship, and the table beside it: what each takes and gives, read from the files."""
 
-import csv
-import io
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -11,6 +9,7 @@ import onnx
 import yaml
 
 from sigmaslam.errors import InputError
+from sigmaslam.files import csv_text
 from sigmaslam_models.model_card import fill_template
 
 PAGE_COMMAND = "sigmaslam train export --page docs/onnx.md"
@@ -37,10 +36,9 @@ def graph_page(folder: Path, command: str) -> tuple[str, str]:
         raise InputError(f"{folder} has no .onnx files: give the folder that `sigmaslam train export` wrote")
     names = [*(name for name in graph_texts() if name in paths), *(name for name in paths if name not in graph_texts())]
     graphs = [_describe(name, paths[name]) for name in names]
-    table = io.StringIO()
     rows = ((graph["name"], *row) for graph in graphs for row in graph["rows"])
-    csv.writer(table, lineterminator="\n").writerows([("graph", "", "name", "type", "shape", "meaning"), *rows])
-    return fill_template("onnx.md", command=command, graphs=graphs, table="onnx.csv"), table.getvalue()
+    table = csv_text([("graph", "", "name", "type", "shape", "meaning"), *rows])
+    return fill_template("onnx.md", command=command, graphs=graphs, table="onnx.csv"), table
 
 
 def _describe(name: str, path: Path) -> dict[str, Any]:

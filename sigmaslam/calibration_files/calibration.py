@@ -61,7 +61,7 @@ def read_calibration(
     paths = _files(Path(path))
     if len(paths) == len(UNDISTORTED):
         return read_four_seasons(paths)
-    texts = [_read_text(each) for each in paths]
+    texts = [read_text(each, CALIBRATION_BYTES, "the calibration", CalibrationError) for each in paths]
     if len(paths) == 2:
         return _read_pair((paths[0], paths[1]), texts, image_size, rectified)
     path, text = paths[0], texts[0]
@@ -127,10 +127,6 @@ def _files(path: Path) -> list[Path]:
     if not path.exists() and len(names) in (2, len(UNDISTORTED)) and all(names):
         return [Path(name) for name in names]
     return [path]
-
-
-def _read_text(path: Path) -> str:
-    return read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
 
 
 def _read_pair(

@@ -1,7 +1,5 @@
 """`sigmaslam localize`."""
 
-import csv
-import io
 import time
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -14,7 +12,7 @@ from rich.table import Table
 
 from sigmaslam.cli.extras import need_torch
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, check_new_folder, make_folder
+from sigmaslam.files import atomic_write_text, check_new_folder, csv_text, make_folder
 
 RecordingFormat = StrEnum("RecordingFormat", ["auto", "mrclam", "tubes", "csv", "starry"])
 """Kinds of recordings; auto tells by the files."""
@@ -182,11 +180,8 @@ def _print_rows(rows: Sequence[_Row]) -> None:
 
 def _write_rows(path: Path, rows: Sequence[_Row]) -> None:
     shown = _shown(rows)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["filter", "robot", *shown])
-    writer.writerows([name, robot, *(summary.get(label, "") for label in shown)] for name, robot, summary in rows)
-    atomic_write_text(path, text.getvalue())
+    cells = ([name, robot, *(summary.get(label, "") for label in shown)] for name, robot, summary in rows)
+    atomic_write_text(path, csv_text([["filter", "robot", *shown], *cells]))
 
 
 def _cell(value: Any) -> str:

@@ -1,8 +1,6 @@
 """The folder of a run: what is known of each frame is written there as it comes."""
 
-import csv
 import hashlib
-import io
 import json
 import os
 import platform
@@ -18,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, check_new_folder, printable, save_arrays, write_ply
+from sigmaslam.files import atomic_write_text, check_new_folder, csv_text, printable, save_arrays, write_ply
 from sigmaslam.frontend.build import own_networks
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -160,9 +158,7 @@ class RunWriter:
         )
 
     def _add_row(self, fields: Sequence[Any]) -> None:
-        line = io.StringIO()
-        csv.writer(line, lineterminator="\n").writerow(fields)
-        self._table.append(line.getvalue().encode("utf-8"))
+        self._table.append(csv_text([fields]).encode("utf-8"))
 
 
 def check_has_trajectory(run: Path) -> None:

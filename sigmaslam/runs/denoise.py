@@ -60,7 +60,7 @@ class StereoFilter:
             FrameError: the images are too small to filter.
         """
         left, right = (
-            _to_grey(_filter_next(eye, image, f"frame {frame.index}"))
+            to_bytes(_filter_next(eye, image, f"frame {frame.index}"))
             for eye, image in zip(self._eyes, (frame.left, frame.right), strict=True)
         )
         return replace(frame, left=left, right=right)
@@ -188,13 +188,14 @@ def _check_size(image: np.ndarray, name: str) -> None:
         raise FrameError(f"{name}: is {width}x{height} pixels; images from {_MIN_SIDE}x{_MIN_SIDE} on are filtered")
 
 
-def _to_grey(image: np.ndarray) -> np.ndarray:
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Grey levels as an 8-bit image stores them."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
 
 def _write(path: Path, image: np.ndarray) -> None:
     with atomic_path(path) as temporary:
-        cv2.imwrite(str(temporary), _to_grey(image))
+        cv2.imwrite(str(temporary), to_bytes(image))
 
 
 def _describe_noise(noise: NoiseModel) -> str:

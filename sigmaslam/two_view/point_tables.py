@@ -9,7 +9,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, load_columns, read_text
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_write_text, csv_text
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rigid_motion, se3_inverse
@@ -51,7 +51,7 @@ def triangulate_file(source: Path, camera: StereoCamera, out: Path, method: str,
         for name, point, cells, used in zip(names, points.tolist(), upper.tolist(), usable.tolist(), strict=True)
         if used
     ]
-    _write_table(out, ["id", *_PLACE, *_COVARIANCE], rows)
+    atomic_write_text(out, csv_text([["id", *_PLACE, *_COVARIANCE], *rows]))
     depth, sigma_depth = points[usable, 2], np.sqrt(spread[usable, 2, 2])
     missed = int((_misses(camera, points[usable], pixels[usable]) > _MOST_MISSED).sum())
     warning = (
@@ -203,11 +203,3 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[list[str], np.nda
     if not rows:
         raise InputError(f"{path}: has a header and no rows: give points")
     return names, np.array(rows)
-
-
-def _write_table(path: Path, header: list[str], rows: list[list[str]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    atomic_write_text(path, text.getvalue())

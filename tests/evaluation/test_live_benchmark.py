@@ -61,7 +61,6 @@ def test_a_wrong_position_is_wrong_where_it_is_called_tracking():
     statuses = ["starting", *["tracking"] * 4, "lost", "relocalised", *["tracking"] * 3]
     found = judge(estimated(true, errors, statuses), References(true))
     assert found.wrong == [4]
-    assert found.relocalised_wrong == 1
     assert found.judged == 7
     assert found.statuses == {"starting": 1, "tracking": 7, "lost": 1, "relocalised": 1}
     assert (found.metres, found.sigmas, found.end_metres) == pytest.approx((0.1, 5.0, 0.0))

@@ -33,13 +33,10 @@ def pairs(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Deco
         return write_pairs(tmp_path_factory.mktemp("pairs"), islice(frames, FRAMES), sequence.camera)
 
 
-def _timing(cpu_ms: float, keyframes: bool = False, version: str = "") -> MethodTiming:
-    """Of four frames, the last a keyframe which takes twice as long."""
+def _timing(cpu_ms: float, version: str = "") -> MethodTiming:
+    """Of four frames, the last of which takes twice as long."""
     time = [cpu_ms, cpu_ms, cpu_ms, 2 * cpu_ms]
-    stages = {stage: [each / 5 for each in time] for stage in ("rectify", "features", "match", "filter", "map")}
-    return MethodTiming(
-        time, time, stages if keyframes else {}, [False] * 3 + [keyframes], [9] * 4, 6, [], [], 0.5, 100.0, version
-    )
+    return MethodTiming(time, time, 6, [], [], 0.5, 100.0, version)
 
 
 def _run(method: str, threads: int, turn: int, timing: MethodTiming, section: str = SEQUENCE) -> TimedRun:
@@ -77,7 +74,7 @@ def test_a_resized_camera_sees_the_same_rays(pairs: DecodedPairs, tmp_path: Path
 def test_a_process_of_its_own_tells_what_a_method_took(pairs: DecodedPairs, method: str):
     timing = time_method(TimingJob(str(pairs.folder), method))
     assert timing.frames == len(timing.poses) == len(timing.timestamps) == FRAMES
-    assert len(timing.cpu_ms) == len(timing.wall_ms) == len(timing.landmarks) == FRAMES - 2
+    assert len(timing.cpu_ms) == len(timing.wall_ms) == FRAMES - 2
     assert min(timing.cpu_ms) > 0.1
     # One core has no more CPU time than there is time.
     assert sum(timing.cpu_ms) < 1.05 * sum(timing.wall_ms) + 1.0
@@ -86,13 +83,6 @@ def test_a_process_of_its_own_tells_what_a_method_took(pairs: DecodedPairs, meth
     np.testing.assert_allclose(timing.poses[0], np.eye(4), atol=1e-9)
     steps = np.linalg.norm(np.diff(np.array(timing.poses)[:, :3, 3], axis=0), axis=1)
     assert (steps > 0.001).all()
-    assert min(timing.landmarks) > 15
-    if method == "klt":
-        stages = np.sum(list(timing.stages_ms.values()), axis=0)
-        assert (stages <= np.array(timing.wall_ms) + 0.01).all()
-        assert (stages > 0.8 * np.array(timing.wall_ms)).all()
-    else:
-        assert timing.stages_ms == {}
 
 
 def test_a_process_that_fails_is_told_of_with_its_last_words(tmp_path: Path):
@@ -175,9 +165,9 @@ def test_the_page_has_means_over_frames_medians_over_rounds_and_ratios_within_th
     runs: list[TimedRun | Omission] = []
     for turn, slowness in enumerate((1.0, 2.0, 10.0)):  # the machine was busy
         for threads in (1, 2):
-            runs.append(_run("ours", threads, turn, _timing(30.0 * slowness, True)))
+            runs.append(_run("ours", threads, turn, _timing(30.0 * slowness)))
             runs.append(_run("cuvslam", threads, turn, _timing(10.0 * slowness, version="dim-odom 1.0")))
-    runs.append(_run("ours", 1, 0, _timing(30.0, True), SIZE))
+    runs.append(_run("ours", 1, 0, _timing(30.0), SIZE))
     page = format_runtime(runs, "the command", 3)
     assert "`the command`" in page
     assert "3 rounds" in page

@@ -30,14 +30,9 @@ GOOD = ShakeResult(
     wrong_step=[],
     wrong_second=[],
     wrong_start=[],
-    worst_step=1.5,
-    worst_second=2.0,
-    worst_start=2.5,
-    step_metres=0.002,
-    step_degrees=0.05,
 )
-STILL = ShakenSequence("room1000", (640, 480), 0.0, ImageMotion(40.0, 75.0, 20.0, 20.1))
-MOVING = ShakenSequence("room1001", (640, 480), 0.3, ImageMotion(35.0, 60.0, 17.5, 17.4))
+STILL = ShakenSequence("room1000", (640, 480), 0.0, ImageMotion(40.0, 75.0, 20.0))
+MOVING = ShakenSequence("room1001", (640, 480), 0.3, ImageMotion(35.0, 60.0, 17.5))
 
 
 def walk(rng: np.random.Generator, count: int) -> Trajectory:
@@ -66,8 +61,8 @@ def test_errors_of_independent_poses_are_in_sigmas_what_was_drawn():
     estimate = Trajectory(truth.timestamps, truth.poses @ se3_inverse(se3_exp(errors)))
     for frames in (1, 20, None):
         found = motion_errors(estimate, truth, covariance, frames)
-        assert np.isnan(found.sigmas[: frames or 1]).all()
-        judged = found.sigmas[frames or 1 :]
+        assert np.isnan(found[: frames or 1]).all()
+        judged = found[frames or 1 :]
         # As many inside one sigma and two as of a Gaussian.
         assert (judged < 1.0).mean() == pytest.approx(0.683, abs=0.03)
         assert (judged < 2.0).mean() == pytest.approx(0.954, abs=0.015)
@@ -82,16 +77,14 @@ def test_one_wrong_step_is_found_where_it_is_and_for_a_while_after():
     covariance = np.broadcast_to(1e-6 * np.eye(6), (60, 6, 6))
     estimate = Trajectory(truth.timestamps, poses)
     step, second, start = (motion_errors(estimate, truth, covariance, frames) for frames in (1, 20, None))
-    assert np.flatnonzero(step.sigmas > 5).tolist() == [30]
-    assert np.flatnonzero(second.sigmas > 5).tolist() == list(range(30, 50))
-    assert np.flatnonzero(start.sigmas > 5).tolist() == list(range(30, 60))
-    assert step.metres[30] == pytest.approx(0.05)
-    assert np.nanmax(step.degrees) == pytest.approx(0.0, abs=1e-5)
+    assert np.flatnonzero(step > 5).tolist() == [30]
+    assert np.flatnonzero(second > 5).tolist() == list(range(30, 50))
+    assert np.flatnonzero(start > 5).tolist() == list(range(30, 60))
     # Against the covariances of both poses, which are one millimetre and one milliradian large.
     adjoint = se3_adjoint(se3_inverse(truth.poses[29]) @ poses[30])
     claimed = 1e-6 * (np.eye(6) + np.linalg.inv(adjoint) @ np.linalg.inv(adjoint).T)
     error = np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert step.sigmas[30] == pytest.approx(sigmas_of_pose(np.array([error @ np.linalg.solve(claimed, error)]))[0])
+    assert step[30] == pytest.approx(sigmas_of_pose(np.array([error @ np.linalg.solve(claimed, error)]))[0])
 
 
 def test_covariances_of_another_length_are_refused():
@@ -134,7 +127,6 @@ def test_flow_and_blur_of_a_render_are_those_of_its_dense_truth(shaken_folder: P
     assert found.flow == pytest.approx(np.linalg.norm(flows, axis=1).max(), rel=0.1)
     assert found.reversal == pytest.approx(largest_reversal(flows, 10), rel=0.1)
     assert found.blur_left == pytest.approx(0.5 * found.flow)
-    assert found.blur_right == pytest.approx(found.blur_left, rel=0.1)
 
 
 def test_a_method_that_is_right_has_no_wrong_frame_and_one_that_jumps_has(shaken_folder: Path):
@@ -151,8 +143,6 @@ def test_a_method_that_is_right_has_no_wrong_frame_and_one_that_jumps_has(shaken
     assert right.tracking == wrong.tracking == 7
     assert not {5, 6} & set(right.wrong_step)
     assert {5, 6} <= set(wrong.wrong_step)
-    assert wrong.step_metres == pytest.approx(0.5, abs=0.05)
-    assert wrong.worst_step > 5 > right.worst_step
 
 
 def test_the_page_counts_wrong_frames_and_says_what_is_missed():

@@ -6,14 +6,13 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.rendered_camera import open_rendered
 from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.trial import Trial
 from sigmaslam_evaluation.truth_conventions import find_truth
 from sigmaslam_synthetic.simulation import Recipe
 
-METHODS = {"KLT + PnP": TrackerConfig()}
+METHODS = ["KLT + PnP"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,13 +32,16 @@ def pose_steps(batch: int) -> dict[str, Step]:
 
 def plane_steps(batch: int) -> dict[str, Step]:
     """A robot in R^3 (x, y, heading): driven, then range and bearing of a landmark. By the filters' names."""
-    motion = filters.MotionModel(_drive, _diagonal(1e-4, 1e-4, 1e-6))
-    draw = _normal(batch)
-    see = range_and_bearing(_diagonal(1e-2, 1e-4))
+    (motion, see), draw = robot_models(), _normal(batch)
     return _steps(None, draw(3), 3, motion, see, 0.1 * draw(2), draw(2), 5.0 * draw(2))
 
 
 KINDS: dict[str, Callable[[int], dict[str, Step]]] = {"SE(3)": pose_steps, "R^3": plane_steps}
+
+
+def robot_models() -> tuple[filters.MotionModel, filters.MeasurementModel]:
+    """Of a robot in R^3 that is driven by metres and radians, and of range and bearing of a landmark."""
+    return filters.MotionModel(_drive, _diagonal(1e-4, 1e-4, 1e-6)), range_and_bearing(_diagonal(1e-2, 1e-4))
 
 
 def _steps(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 import sigmaslam_filters as filters
-from sigmaslam_filters.systems import range_and_bearing
+from sigmaslam_benchmarks.filters.extended import robot_models
 
 BATCHES = (1, 10, 100, 10_000)
 STEPS = 100
@@ -28,13 +28,12 @@ def make(batch: int, steps: int = STEPS) -> dict[str, Callable[[], Beliefs]]:
         numbers = torch.randn(*shape[:1], batch, *shape[1:], generator=generator, dtype=torch.float64)
         return numbers[:, 0] if batch == 1 else numbers
 
-    motion = filters.MotionModel(_drive, _diagonal(1e-4, 1e-4, 1e-6))
-    see = range_and_bearing(_diagonal(1e-2, 1e-4))
+    motion, see = robot_models()
     ukf = filters.UnscentedKalmanFilter(iterations=1, on_failure="hold")
     controls, landmarks = 0.1 * draw(steps - 1, 2), 5.0 * draw(steps, 2)
     states = [draw(1, 3)[0]]
     for control in controls:
-        states.append(_drive(states[-1], control))
+        states.append(motion.function(states[-1], control))
     values = see.function(torch.stack(states), landmarks) + draw(steps, 2) * torch.tensor([0.1, 0.01]).double()
     prior = filters.Gaussian(states[0], 0.01 * torch.eye(3, dtype=torch.float64))
 
@@ -69,13 +68,3 @@ def make(batch: int, steps: int = STEPS) -> dict[str, Callable[[], Beliefs]]:
         return track.filtered.mean, track.filtered.covariance
 
     return {"`filter`": by_filter, "loop around `compile_step`": by_steps, "`compile_filter`": by_compiled_filter}
-
-
-def _drive(state: Tensor, control: Tensor) -> Tensor:
-    x, y, heading = state[..., 0], state[..., 1], state[..., 2]
-    distance, turn = control[..., 0], control[..., 1]
-    return filters.stack([x + distance * torch.cos(heading), y + distance * torch.sin(heading), heading + turn])
-
-
-def _diagonal(*variances: float) -> filters.Diagonal:
-    return filters.Diagonal(torch.tensor(variances, dtype=torch.float64))

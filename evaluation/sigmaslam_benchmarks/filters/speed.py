@@ -224,10 +224,7 @@ def _ratio(middle: float, low: float, high: float) -> str:
 
 
 def _rate(rates: list[float]) -> str:
-    return _thousands(statistics.median(rates))
-
-
-def _thousands(value: float) -> str:
+    value = statistics.median(rates)
     return f"{value / 1e6:.2f} M" if value >= 1e6 else f"{value / 1e3:.3g} k"
 
 

@@ -274,7 +274,9 @@ def step_stereo_low_rank(work: StereoWork) -> Belief:
     The push-through identity turns X^T D (D^T D + I)^-1 into X^T (D D^T + I)^-1 D, with D the whitened deviations,
     Barfoot & McManus 2011.
     """
-    mean, covariance = _predict_stereo(work)
+    mean, covariance = _predict(
+        work.mean, work.covariance, lambda states: advance(states, work.transition), work.process_noise
+    )
     states = _sigma_points(mean, covariance)
     pixels = project_stereo(np, states, work.points)
     sigma = np.sqrt(np.diagonal(work.measurement_noise))
@@ -336,10 +338,6 @@ def _predict(mean: Array, covariance: Array, transition: Function, process_noise
     mean = states.mean(axis=0)
     deviations = states - mean
     return mean, deviations.T @ deviations / len(states) + process_noise
-
-
-def _predict_stereo(work: StereoWork) -> Belief:
-    return _predict(work.mean, work.covariance, lambda states: advance(states, work.transition), work.process_noise)
 
 
 def _update(

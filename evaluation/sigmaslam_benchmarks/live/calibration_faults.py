@@ -12,11 +12,7 @@ import numpy as np
 from sigmaslam.calibration.tracker_covariance import nearest_errors
 from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, Fault, Frames, delay_right
-
-
-def _good(frames: Frames, rng: np.random.Generator) -> Frames:
-    return frames
+from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, Fault, delay_right
 
 
 def move_centre(columns: float, camera: StereoCamera) -> StereoCamera:
@@ -54,7 +50,7 @@ def bend_right(k1: float, camera: StereoCamera) -> StereoCamera:
 def _sizes(name: str, words: str, change: Any, sizes: dict[str, Any]) -> dict[str, Fault]:
     """A fault of three sizes."""
     return {
-        f"{name}_{size}": Fault(words.format(size), _good, miscalibrate=partial(change, value))
+        f"{name}_{size}": Fault(words.format(size), FAULTS[NO_FAULT].spoil, miscalibrate=partial(change, value))
         for size, value in sizes.items()
     }
 

@@ -83,7 +83,6 @@ class Judgement:
         statuses: frames by status; those without a pose and those that started included.
         judged: frames called `tracking` whose error is known.
         wrong: of these, moments of the frames beyond the 99.9 % bound of position or pose.
-        relocalised_wrong: frames called `relocalised` beyond it.
         metres, sigmas: largest errors of the position of frames called `tracking`; NaN where there is none.
         end_metres: of the last frame with a pose.
         away_wrong: as `wrong`, against the run with good frames in place of the truth.
@@ -100,7 +99,6 @@ class Judgement:
     statuses: Mapping[str, int]
     judged: int
     wrong: Sequence[int]
-    relocalised_wrong: int
     metres: float
     sigmas: float
     end_metres: float
@@ -169,7 +167,6 @@ def judge(
         said, refused, learned: see `Judgement`.
     """
     tracking = np.array([each.status == "tracking" for each in poses], bool)
-    relocalised = np.array([each.status == "relocalised" for each in poses], bool)
     errors = pose_errors(poses, truth)
     away = errors if good is None else pose_errors(poses, good)
     known, sigmas = (each[np.isfinite(errors.metres)] for each in (errors.metres, errors.sigmas))
@@ -178,7 +175,6 @@ def judge(
         statuses=dict(Counter(each.status for each in poses)),
         judged=int((tracking & np.isfinite(errors.pose)).sum()),
         wrong=[poses[k].moment for k in np.flatnonzero(errors.beyond & tracking).tolist()],
-        relocalised_wrong=int((errors.beyond & relocalised).sum()),
         metres=_largest(errors.metres[tracking]),
         sigmas=_largest(errors.sigmas[tracking]),
         end_metres=float(known[-1]) if len(known) else float("nan"),

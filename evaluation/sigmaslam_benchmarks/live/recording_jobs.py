@@ -1,6 +1,5 @@
 """Recordings that are judged in workers, each result kept at once and used again while the code is the same."""
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -10,9 +9,10 @@ from typing import Any, Self
 
 from sigmaslam import errors
 from sigmaslam.errors import InputError, OutputError
-from sigmaslam.files import atomic_write_text, make_folder
+from sigmaslam.files import make_folder
 from sigmaslam_benchmarks.code_hash import hash_code
 from sigmaslam_benchmarks.live.recordings import GoodFrames, Recording
+from sigmaslam_benchmarks.trial import read_figures, write_figures
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 
 
@@ -45,11 +45,7 @@ class RecordingJob:
 
     def read(self, name: str) -> dict[str, Any] | None:
         """The figures; None where they are missing or of something else."""
-        path = self.path(name)
-        if not path.is_file():
-            return None
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return dict(content["result"]) if content.get("made_from") == self._made_from() else None
+        return read_figures(self.path(name), self._made_from())
 
     def make(self) -> str:
         """Judges what is missing; each result is kept at once."""
@@ -58,8 +54,7 @@ class RecordingJob:
         began, missing = time.perf_counter(), self.missing
         good = self.recording.open(self.runs, self.data)
         for name in missing:
-            content = {"made_from": self._made_from(), "result": self.judge(self, good, self.tasks[name])}
-            atomic_write_text(self.path(name), json.dumps(content, indent=1) + "\n")
+            write_figures(self.path(name), self._made_from(), self.judge(self, good, self.tasks[name]))
         return f"{len(missing)} runs in {time.perf_counter() - began:.0f} s"
 
     def path(self, name: str) -> Path:

@@ -40,18 +40,24 @@ def warped_pair(photograph: np.ndarray, rng: np.random.Generator, name: str) -> 
 
 def middlebury(folder: Path) -> list[ImagePair]:
     """Motorcycle (2014) and Aloe (2006)."""
-    motorcycle = folder / "Motorcycle"
+    scenes = middlebury_scenes(folder)
+    aloe = scenes["aloe"][2]
+    aloe[find_occluded(aloe)] = np.nan
+    return [_disparity_pair(name, *scene) for name, scene in scenes.items()]
+
+
+def middlebury_scenes(folder: Path) -> dict[str, tuple[Path, Path, np.ndarray]]:
+    """Left and right image with disparities (H, W), NaN where they are unknown and, in Motorcycle, what is occluded."""
+    motorcycle, aloe = folder / "Motorcycle", folder / "aloe"
     disparity = _read_pfm(motorcycle / "disp0GT.pfm")
     occluded = read_image(motorcycle / "mask0nocc.png") != 255
     disparity[occluded | ~np.isfinite(disparity)] = np.nan
-    aloe = folder / "aloe"
-    disparity_aloe = read_image(aloe / "aloeGT.png").astype(np.float64)
-    disparity_aloe[disparity_aloe == 0] = np.nan
-    disparity_aloe[find_occluded(disparity_aloe)] = np.nan
-    return [
-        _disparity_pair("Motorcycle", motorcycle / "im0.png", motorcycle / "im1.png", disparity),
-        _disparity_pair("aloe", aloe / "aloeL.jpg", aloe / "aloeR.jpg", disparity_aloe),
-    ]
+    whole = read_image(aloe / "aloeGT.png").astype(np.float64)
+    whole[whole == 0] = np.nan
+    return {
+        "Motorcycle": (motorcycle / "im0.png", motorcycle / "im1.png", disparity),
+        "aloe": (aloe / "aloeL.jpg", aloe / "aloeR.jpg", whole),
+    }
 
 
 def find_occluded(disparity: np.ndarray) -> np.ndarray:

@@ -67,7 +67,8 @@ def compare_starts(
                 pose = estimate()
                 times[turn, column] = 1e3 * (time.perf_counter() - begin)
                 if turn == 0:
-                    measured.setdefault(name, []).append((*_errors(pose, truth.T_1_0), 0.0))
+                    errors = (180.0, 180.0) if pose is None else pose_errors_deg(*pose, truth.T_1_0)
+                    measured.setdefault(name, []).append((*errors, 0.0))
         for column, name in enumerate(contenders):
             measured[name][-1] = (*measured[name][-1][:2], float(times[:, column].min()))
     return {name: _summary(np.array(values)) for name, values in measured.items()}
@@ -90,10 +91,6 @@ def _contenders(
         "MAGSAC, our refined matches": lambda: pose_by_magsac(probable_points[0], probable_points[1], K),
         "ours": ours,
     }
-
-
-def _errors(pose: _Pose, T_1_0: np.ndarray) -> tuple[float, float]:
-    return (180.0, 180.0) if pose is None else pose_errors_deg(*pose, T_1_0)
 
 
 def _summary(values: np.ndarray) -> StartScore:

@@ -1,7 +1,5 @@
 """Errors of poses in the sigmas that the tracker claims: over a step, over some frames, since the start."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import ndtri_exp
 
@@ -11,23 +9,9 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam_evaluation.metrics.trajectory_errors import associate, is_regular
 
 
-@dataclass(frozen=True, slots=True)
-class MotionErrors:
-    """Errors of the motion that ends at each frame.
-
-    Attributes:
-        sigmas: (N,) size of the error under what is claimed, see `sigmas_of_pose`; NaN where nothing is claimed.
-        metres, degrees: (N,) lengths of the error's translation and rotation; NaN where there is no motion.
-    """
-
-    sigmas: np.ndarray
-    metres: np.ndarray
-    degrees: np.ndarray
-
-
 def motion_errors(
     estimate: Trajectory, truth: Trajectory, covariance: np.ndarray, frames: int | None = None
-) -> MotionErrors:
+) -> np.ndarray:
     """How wrong the motion to each pose is from the pose some frames before, or from the first pose.
 
     Of the absolute poses' errors only the covariance of each is known, not that between them. The motion is held
@@ -40,6 +24,9 @@ def motion_errors(
         covariance: (N, 6, 6) of the poses in their body frames, translation (metres) before rotation (radians),
             relative to the first one.
         frames: between the two poses; None: from the first one.
+    Returns:
+        (N,) size of the error of the motion that ends at each frame under what is claimed, see `sigmas_of_pose`; NaN
+        where nothing is claimed.
     Raises:
         ValueError: the covariance is not (N, 6, 6), or frames is not positive.
         InputError: no timestamps agree.
@@ -58,11 +45,9 @@ def motion_errors(
     errors = se3_log(se3_inverse(motion) @ se3_inverse(true[first]) @ true[last])
     claimed = covariance[last] + turn_covariance(se3_inverse(motion), covariance[first])
     regular = is_regular(claimed)
-    sigmas, metres, degrees = (np.full(count, np.nan) for _ in range(3))
+    sigmas = np.full(count, np.nan)
     sigmas[last[regular]] = sigmas_of_pose(squared_mahalanobis(errors[regular], claimed[regular]))
-    metres[last] = np.linalg.norm(errors[:, :3], axis=1)
-    degrees[last] = np.rad2deg(np.linalg.norm(errors[:, 3:], axis=1))
-    return MotionErrors(sigmas, metres, degrees)
+    return sigmas
 
 
 def sigmas_of_pose(squares: np.ndarray) -> np.ndarray:

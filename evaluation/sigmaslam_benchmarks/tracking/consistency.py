@@ -1,11 +1,10 @@
 """Whether poses and map are as sure as they say, and whether covariances of matches pay: renders with exact truth."""
 
-import json
 import os
 from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import replace
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +16,14 @@ from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam_benchmarks.code_hash import hash_code
-from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered
+from sigmaslam_benchmarks.code_hash import hash_once
+from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered, read_simulation
 from sigmaslam_benchmarks.tracking.consistency_page import DRAWN, ConsistencyResult, Scale, format_noise, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Trial, track_ours
 from sigmaslam_evaluation.metrics import map_consistency as consistency
 from sigmaslam_evaluation.truth_conventions import find_truth
-from sigmaslam_synthetic.render_sequence import SCENE_NAME
-from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
+from sigmaslam_synthetic.simulation import Recipe, Studio
 
 # The images of all three are rectified, so that the injected offset shifts all disparities alike.
 SCALES = (
@@ -83,23 +81,18 @@ def write_consistency(
         for seed in range(_FIRST_SEED, _FIRST_SEED + seeds)
         for scale in SCALES
     ]
-    return write_trials(path, runs, TrialKind(METHODS, _track, _hash_code), recipes, form, workers, ray, note)
+    kind = TrialKind(METHODS, _track, partial(hash_once, Path(__file__)))
+    return write_trials(path, runs, kind, recipes, form, workers, ray, note)
 
 
 write_noise = partial(write_consistency, form_page=format_noise)
 """The same sequences and results, own covariances beside one for all."""
 
 
-@cache
-def _hash_code() -> str:
-    return hash_code(Path(__file__))
-
-
 @lru_cache(maxsize=1)
 def _open_scene(source: Path) -> Studio:
     """Of a sequence, whose methods are judged one after another."""
-    content = json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))
-    return Studio(Simulation.from_json(content["simulation"]))
+    return Studio(read_simulation(source))
 
 
 def depths_around(studio: Studio, frame: int, pixels: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from sigmaslam.files import atomic_path, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import list_images
+from sigmaslam.runs.denoise import to_bytes
 from sigmaslam.runs.request import TrackerOptions
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from sigmaslam_benchmarks.trial import Trial, render, track_ours
@@ -95,11 +96,6 @@ def non_local_means(image: np.ndarray, noise: NoiseModel) -> np.ndarray:
     """OpenCV's, for the mean variance of the noise: 7 x 7 patches in 21 x 21 pixels, h = 0.9 sigma."""
     sigma = float(np.sqrt(noise.variance(image).mean()))
     return np.asarray(cv2.fastNlMeansDenoising(to_bytes(image), None, 0.9 * sigma, 7, 21))
-
-
-def to_bytes(image: np.ndarray) -> np.ndarray:
-    """Grey levels as an 8-bit image stores them."""
-    return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
 
 _FILTERS: dict[str, Filter] = {

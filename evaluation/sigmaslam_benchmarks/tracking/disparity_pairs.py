@@ -8,6 +8,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.reconstruction.disparity import pixel_grid
+from sigmaslam_benchmarks.matching.photographs import middlebury_scenes
 from sigmaslam_synthetic.simulation import Recipe, Studio, simulate
 
 DRIVE, MIDDLEBURY = "kitti_raw_0926_0039_a", "disparity_middlebury"
@@ -103,29 +104,11 @@ def _lidar_pairs(folder: Path) -> list[DisparityPair]:
 
 
 def _middlebury_pairs(folder: Path) -> dict[str, list[DisparityPair]]:
-    scene = folder / "Motorcycle"
-    truth = _read_pfm(scene / "disp0GT.pfm")
-    truth = np.where(np.isfinite(truth) & (_grey(scene / "mask0nocc.png") == 255), truth, np.float32(np.nan))
-    whole = _grey(folder / "aloe" / "aloeGT.png").astype(np.float32)
-    whole[whole == 0.0] = np.nan
-    return {
-        "Motorcycle": [_pair(scene / "im0.png", scene / "im1.png", truth, _STRUCTURED_LIGHT)],
-        "aloe": [_pair(folder / "aloe" / "aloeL.jpg", folder / "aloe" / "aloeR.jpg", whole, _WHOLE_PIXELS)],
-    }
-
-
-def _pair(left: Path, right: Path, truth: np.ndarray, sigma: float) -> DisparityPair:
-    return DisparityPair(_grey(left), _grey(right), truth, np.full(truth.shape, sigma, np.float32))
-
-
-def _read_pfm(path: Path) -> np.ndarray:
-    """(H, W) float32 of a grey PFM; OpenCV's reader applies the scale, which says the order of the bytes alone."""
-    if not path.is_file():
-        raise InputError(f"{path}: is missing: give --data the folder with {MIDDLEBURY}")
-    _, size, scale, content = path.read_bytes().split(b"\n", 3)
-    width, height = map(int, size.split())
-    values = np.frombuffer(content, "<f4" if float(scale) < 0.0 else ">f4").reshape(height, width)
-    return np.flipud(values).astype(np.float32)
+    sigmas, pairs = {"Motorcycle": _STRUCTURED_LIGHT, "aloe": _WHOLE_PIXELS}, {}
+    for name, (left, right, truth) in middlebury_scenes(folder).items():
+        sigma = np.full(truth.shape, sigmas[name], np.float32)
+        pairs[name] = [DisparityPair(_grey(left), _grey(right), truth.astype(np.float32), sigma)]
+    return pairs
 
 
 def _grey(path: Path) -> np.ndarray:

@@ -1,56 +1,46 @@
 """How hard a rendered sequence moves in the image: flow, its reversals and the blur, from the exact landmarks."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sigmaslam_synthetic.render_sequence import LANDMARKS_NAME, SCENE_NAME
-from sigmaslam_synthetic.simulation import Simulation
+from sigmaslam_benchmarks.rendered_camera import read_simulation
+from sigmaslam_synthetic.render_sequence import LANDMARKS_NAME
 
 _FEWEST = 8  # landmarks whose median is a flow
 
 
 @dataclass(frozen=True, slots=True)
 class ImageMotion:
-    """Of what rests, median over the image.
+    """Of what rests, in the left image, the median over it.
 
     Attributes:
         flow: largest length from a frame to the next one, pixels.
         reversal: largest difference between two flows within half a second, pixels.
-        blur_left, blur_right: largest length of the motion blur, pixels.
+        blur_left: largest length of the motion blur, pixels.
     """
 
     flow: float
     reversal: float
     blur_left: float
-    blur_right: float
 
 
 def read_image_motion(source: Path) -> ImageMotion:
     """The motion in a rendered folder."""
-    simulation = Simulation.from_json(json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))["simulation"])
+    simulation = read_simulation(source)
     with np.load(source / LANDMARKS_NAME) as content:
         landmarks = dict(content)
     still = ~simulation.scene.moving[landmarks["body"]]
-    left, right = (
-        _flows(
-            simulation.frames,
-            landmarks["track_frame"],
-            landmarks["track_landmark"],
-            landmarks[f"track_{eye}"],
-            landmarks[f"track_{eye}_visible"] & still[landmarks["track_landmark"]],
-        )
-        for eye in ("left", "right")
+    flows = _flows(
+        simulation.frames,
+        landmarks["track_frame"],
+        landmarks["track_landmark"],
+        landmarks["track_left"],
+        landmarks["track_left_visible"] & still[landmarks["track_landmark"]],
     )
-    shutter = simulation.sensor.shutter
-    return ImageMotion(
-        _largest(left),
-        largest_reversal(left, int(0.5 * simulation.fps)),
-        shutter * _largest(left),
-        shutter * _largest(right),
-    )
+    largest = _largest(flows)
+    return ImageMotion(largest, largest_reversal(flows, int(0.5 * simulation.fps)), simulation.sensor.shutter * largest)
 
 
 def largest_reversal(flows: np.ndarray, reach: int) -> float:

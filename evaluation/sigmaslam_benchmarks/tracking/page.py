@@ -1,7 +1,5 @@
 """Pages that benchmarks write and people annotate, and what their tables are made of."""
 
-import csv
-import io
 import os
 import platform
 import re
@@ -13,7 +11,7 @@ import jinja2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_write_text, csv_text
 from sigmaslam.source_commit import describe_source
 
 _MARK = "<!-- notes -->"
@@ -39,10 +37,8 @@ def _put_aside(path: Path, name: str, part: str) -> str:
     """Writes the tables of a part of a page, one below the other, and returns what the page says of them."""
     target = path.with_suffix(f".{name}.csv")
     lines = [line for line in part.splitlines() if line.startswith("|") and not set(line) <= set("|-: ")]
-    written = io.StringIO()
     cells = ([cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines)
-    csv.writer(written, lineterminator="\n").writerows(cells)
-    atomic_write_text(target, written.getvalue())
+    atomic_write_text(target, csv_text(cells))
     return f"[{target.name}]({target.name}), {len(lines) - 1} rows.\n"
 
 

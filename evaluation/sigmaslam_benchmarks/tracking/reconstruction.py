@@ -1,11 +1,10 @@
 """Dense reconstruction on renders with exact depth: errors, their intervals, completeness, ghosts of moving bodies."""
 
-import json
 import os
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from functools import cache
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +15,14 @@ from sigmaslam.reconstruction.disparity import semi_global_disparity
 from sigmaslam.reconstruction.reconstruct import fuse_keyframes
 from sigmaslam.reconstruction.recorded_keyframes import open_input, read_recorded_keyframes
 from sigmaslam.runs.request import TrackerOptions
-from sigmaslam.slam.config import TrackerConfig
-from sigmaslam_benchmarks.code_hash import hash_code
-from sigmaslam_benchmarks.rendered_camera import open_rendered
+from sigmaslam_benchmarks.code_hash import hash_once
+from sigmaslam_benchmarks.rendered_camera import open_rendered, read_simulation
 from sigmaslam_benchmarks.tracking.depth_accuracy import DepthFigures, JudgedPixels, judge_pixels, summarise
 from sigmaslam_benchmarks.tracking.real_disparity import write_real
 from sigmaslam_benchmarks.tracking.reconstruction_page import ReconstructedSequence, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import track_ours
-from sigmaslam_synthetic.render_sequence import SCENE_NAME
-from sigmaslam_synthetic.simulation import Recipe, Simulation, Studio
+from sigmaslam_synthetic.simulation import Recipe, Studio
 
 SIZES = {"street": (576, 176), "room": (360, 270), "organ": (360, 288)}
 """Worlds, and the size of their images: those of the benchmark `consistency`, whose renders may be copied."""
@@ -72,14 +69,9 @@ def write_reconstruction(
         ]
         return format_page(found, seeds, command, missing)
 
-    kind = TrialKind({_METHOD: TrackerConfig()}, _judge, _hash_code)
+    kind = TrialKind([_METHOD], _judge, partial(hash_once, Path(__file__)))
     recipes = [recipe(world, FIRST_SEED + k) for k in range(seeds) for world in SIZES]
     return write_trials(path, runs, kind, recipes, form, workers, ray, note)
-
-
-@cache
-def _hash_code() -> str:
-    return hash_code(Path(__file__))
 
 
 def recipe(world: str, seed: int) -> Recipe:
@@ -91,8 +83,7 @@ def recipe(world: str, seed: int) -> Recipe:
 
 def judge_reconstruction(source: Path) -> DepthFigures:
     """Tracks a rendered folder, fuses the depths of its keyframes and holds them against the exact ones."""
-    content = json.loads((source / SCENE_NAME).read_text(encoding="utf-8"))
-    simulation = Simulation.from_json(content["simulation"])
+    simulation = read_simulation(source)
     studio = Studio(simulation, device="cpu")
     moving = np.array([body.path is not None for body in simulation.scene.bodies] + [False])
     with tempfile.TemporaryDirectory() as scratch:

@@ -4,17 +4,16 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stderr
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.readers.trajectory_files import read_trajectory
 from sigmaslam.runs.request import TrackerOptions
-from sigmaslam.slam.tracker import TrackerConfig
-from sigmaslam_benchmarks.code_hash import hash_code
+from sigmaslam_benchmarks.code_hash import hash_once
 from sigmaslam_benchmarks.rendered_camera import open_rendered
-from sigmaslam_benchmarks.tracking.claimed_errors import MotionErrors, motion_errors
+from sigmaslam_benchmarks.tracking.claimed_errors import motion_errors
 from sigmaslam_benchmarks.tracking.image_motion import ImageMotion, read_image_motion
 from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, ShakeResult, format_page
 from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
@@ -62,7 +61,7 @@ def write_shake(
         }
         return format_page(results, FRAMES, (_FIRST_SEED, seeds), command, missing)
 
-    kind = TrialKind(dict.fromkeys([_MOTION, *METHODS], TrackerConfig()), _judge, _hash_code)
+    kind = TrialKind([_MOTION, *METHODS], _judge, partial(hash_once, Path(__file__)))
     recipes = [recipe(k, _FIRST_SEED) for k in range(seeds)]
     return write_trials(path, runs, kind, recipes, form, workers, ray, note)
 
@@ -72,11 +71,6 @@ def _describe(trials: SequenceTrials) -> ShakenSequence:
     recipe, preset = trials.recipe, PRESETS[trials.recipe.preset]
     size = (recipe.width or preset.width, recipe.height or preset.height)
     return ShakenSequence(recipe.name, size, recipe.movers, ImageMotion(**trials.read(_MOTION) or {}))
-
-
-@cache
-def _hash_code() -> str:
-    return hash_code(Path(__file__))
 
 
 def recipe(number: int, first_seed: int) -> Recipe:
@@ -109,11 +103,6 @@ def judge(source: Path, method: Method) -> ShakeResult:
         wrong_step=_wrong(step, tracked),
         wrong_second=_wrong(second, tracked),
         wrong_start=_wrong(start, tracked),
-        worst_step=_largest(step.sigmas[tracked]),
-        worst_second=_largest(second.sigmas[tracked]),
-        worst_start=_largest(start.sigmas[tracked]),
-        step_metres=_largest(step.metres[tracked]),
-        step_degrees=_largest(step.degrees[tracked]),
     )
 
 
@@ -121,10 +110,5 @@ def _judge(source: Path, recipe: Recipe, method: str) -> ImageMotion | ShakeResu
     return read_image_motion(source) if method == _MOTION else judge(source, METHODS[method])
 
 
-def _wrong(errors: MotionErrors, tracked: np.ndarray) -> list[int]:
-    return np.flatnonzero((errors.sigmas > GROSS) & tracked).tolist()
-
-
-def _largest(values: np.ndarray) -> float:
-    values = values[np.isfinite(values)]
-    return float(values.max()) if len(values) else float("nan")
+def _wrong(sigmas: np.ndarray, tracked: np.ndarray) -> list[int]:
+    return np.flatnonzero((sigmas > GROSS) & tracked).tolist()

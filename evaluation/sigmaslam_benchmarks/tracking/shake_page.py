@@ -45,8 +45,6 @@ class ShakeResult:
         inside: share of frames inside the 95 % ellipsoid.
         wrong_step, wrong_second, wrong_start: numbers of the frames called `tracking` whose motion from the frame
             before, over a second, and since the first frame is beyond `GROSS` sigmas.
-        worst_step, worst_second, worst_start: largest of these errors of frames called `tracking`, sigmas.
-        step_metres, step_degrees: largest error of the motion from the frame before, of frames called `tracking`.
     """
 
     tracking: int
@@ -58,11 +56,6 @@ class ShakeResult:
     wrong_step: Sequence[int]
     wrong_second: Sequence[int]
     wrong_start: Sequence[int]
-    worst_step: float
-    worst_second: float
-    worst_start: float
-    step_metres: float
-    step_degrees: float
 
     @property
     def percent(self) -> float:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -53,9 +53,6 @@ class MethodTiming:
     Attributes:
         cpu_ms: (N,) CPU time of all threads of the process from one frame to the next, without the reading of pairs.
         wall_ms: (N,).
-        stages_ms: (N,) wall time by stage; empty but for ours.
-        keyframe: (N,) whether the frame became a keyframe; False but for ours.
-        landmarks: (N,) matched; 0 for the peers.
         frames: of the sequence.
         timestamps, poses: (M,) and (M, 4, 4) T_world_camera, of the frames with a pose.
         first_pose_s: from the start of the process to the pose of the second frame; NaN without one.
@@ -65,9 +62,6 @@ class MethodTiming:
 
     cpu_ms: list[float]
     wall_ms: list[float]
-    stages_ms: dict[str, list[float]]
-    keyframe: list[bool]
-    landmarks: list[int]
     frames: int
     timestamps: list[float]
     poses: list[list[list[float]]]
@@ -80,21 +74,13 @@ class FailedMethodError(SigmaSlamError):
     """A method's process ended without a result."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Step:
-    pose: np.ndarray | None
-    landmarks: int = 0
-    keyframe: bool = False
-    stages_ms: dict[str, float] = field(default_factory=dict)
-
-
 class _Method(Protocol):
-    """Steps through the pairs."""
+    """Steps through the pairs; a step gives the pose, or None where there is none."""
 
     rectified: bool
     version: str
 
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step: ...
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None: ...
 
     def close(self) -> None: ...
 
@@ -136,31 +122,27 @@ def run_job(job: TimingJob, started: float) -> MethodTiming:
     _hold_on_cores(job.threads)
     pairs = open_pairs(Path(job.pairs))
     method = _open(job, pairs)
-    steps, walls, own, others = [], [], [], []
+    poses, walls, own, others = [], [], [], []
     first_pose = float("nan")
     for index, timestamp in enumerate(pairs.timestamps):
         left, right = pairs.read(index, method.rectified)
         others.append(_other_threads())
         cpu, wall = time.thread_time(), time.perf_counter()
-        step = method.step(left, right, timestamp)
+        pose = method.step(left, right, timestamp)
         own.append(time.thread_time() - cpu)
         walls.append(time.perf_counter() - wall)
-        if index and step.pose is not None and np.isnan(first_pose):
+        if index and pose is not None and np.isnan(first_pose):
             first_pose = time.time() - started
-        steps.append(step)
+        poses.append(pose)
     # Threads in the background go on while the next pair is read.
     cpus = np.array(own) + np.diff([*others, _other_threads()])
     peak = _peak_mib()
     method.close()
-    counted = steps[WARM_UP:]
-    tracked = [(time, step.pose) for time, step in zip(pairs.timestamps, steps, strict=True) if step.pose is not None]
+    tracked = [(time, pose) for time, pose in zip(pairs.timestamps, poses, strict=True) if pose is not None]
     return MethodTiming(
         cpu_ms=_milliseconds(cpus[WARM_UP:]),
         wall_ms=_milliseconds(walls[WARM_UP:]),
-        stages_ms={stage: [step.stages_ms[stage] for step in counted] for stage in steps[-1].stages_ms},
-        keyframe=[step.keyframe for step in counted],
-        landmarks=[step.landmarks for step in counted],
-        frames=len(steps),
+        frames=len(poses),
         timestamps=[time for time, _ in tracked],
         poses=[pose.tolist() for _, pose in tracked],
         first_pose_s=first_pose,
@@ -186,10 +168,9 @@ class _Ours:
         self.version = ""
         self._tracker = StereoTracker(pairs.camera, OURS[job.method], threads=job.threads)
 
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
         estimate = self._tracker.step(left, right, timestamp)
-        pose = estimate.T_world_camera if estimate.has_pose and estimate.status not in ("lost", "skipped") else None
-        return _Step(pose, estimate.inliers, estimate.tracks is not None, estimate.milliseconds)
+        return estimate.T_world_camera if estimate.has_pose and estimate.status not in ("lost", "skipped") else None
 
     def close(self) -> None:
         """It needs no end."""
@@ -203,9 +184,9 @@ class _Peer:
         self._peer = open_peer(name, camera, pairs.timestamps, own_process=False)
         self.version = self._peer.version
 
-    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> _Step:
+    def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
         step = self._peer.step(left, right, timestamp)
-        return _Step(None if step.status == "lost" else step.T_world_camera, step.inliers)
+        return None if step.status == "lost" else step.T_world_camera
 
     def close(self) -> None:
         self._peer.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING, Any
 from sigmaslam.errors import InputError, OutputError
 from sigmaslam.files import make_folder
 from sigmaslam_benchmarks.tracking.page import write_page
-from sigmaslam_benchmarks.trial import TrialCache, render
+from sigmaslam_benchmarks.trial import read_figures, render, write_figures
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
 from sigmaslam_synthetic.simulation import Recipe
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
-
-    from sigmaslam.slam.tracker import TrackerConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,27 +24,35 @@ class TrialKind:
     """What a benchmark does with every sequence. Its functions are functions of a module: workers receive them.
 
     Attributes:
-        methods: the configuration of each, by which its figures are used again.
+        methods: their names.
         judge: figures of a method, from the rendered folder and its recipe.
         hash_code: hash of all code that figures depend on.
     """
 
-    methods: Mapping[str, TrackerConfig]
+    methods: Collection[str]
     judge: Callable[[Path, Recipe, str], DataclassInstance]
     hash_code: Callable[[], str]
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceTrials:
-    """One sequence, with all methods."""
+    """One sequence, with all methods.
+
+    Attributes:
+        kind: what is done with it.
+        recipe: of the sequence.
+        folder: of renders and figures.
+        code: hash of all code that figures depend on.
+    """
 
     kind: TrialKind
-    cache: TrialCache
     recipe: Recipe
+    folder: Path
+    code: str
 
     def read(self, method: str) -> dict[str, Any] | None:
         """The figures that are kept, unless they are of something else."""
-        return self.cache.read(self.recipe, method, self.kind.methods[method])
+        return read_figures(self._path(method), self._made_from())
 
     @property
     def missing(self) -> list[str]:
@@ -59,17 +65,24 @@ class SequenceTrials:
         Raises:
             InputError: the code here is not that of the process that reads the cache.
         """
-        if self.kind.hash_code() != self.cache.code:
+        if self.kind.hash_code() != self.code:
             raise InputError("this worker has another state of SigmaSLAM: install the same commit wherever jobs run")
         began = time.perf_counter()
-        source = render(self.cache.folder, self.recipe, 1)
+        source = render(self.folder, self.recipe, 1)
         rendered = time.perf_counter()
         missing = self.missing
         for method in missing:
             figures = asdict(self.kind.judge(source, self.recipe, method))
-            self.cache.write(self.recipe, method, self.kind.methods[method], figures)
+            write_figures(self._path(method), self._made_from(), figures)
         tracked = time.perf_counter() - rendered
         return f"{source.name}, rendered in {rendered - began:.0f} s, {len(missing)} methods in {tracked:.0f} s"
+
+    def _path(self, method: str) -> Path:
+        slug = "".join(letter if letter.isalnum() else "_" for letter in method)
+        return self.folder / f"{self.recipe.name}-{slug}.json"
+
+    def _made_from(self) -> dict[str, Any]:
+        return {"recipe": asdict(self.recipe), "code": self.code}
 
 
 def write_trials(
@@ -95,8 +108,8 @@ def write_trials(
         OutputError: a sequence failed, of which the page says that it is missing; or all did, and there is no page.
     """
     make_folder(runs)
-    cache = TrialCache(runs.resolve(), kind.hash_code())
-    jobs = [SequenceTrials(kind, cache, recipe) for recipe in recipes]
+    code = kind.hash_code()
+    jobs = [SequenceTrials(kind, recipe, runs.resolve(), code) for recipe in recipes]
     missing = [job for job in jobs if job.missing]
     note(f"{len(jobs) - len(missing)} of {len(jobs)} sequences are there")
     failed: dict[str, Exception] = {}

@@ -1,5 +1,6 @@
 """The tracker's estimator as ONNX graphs: its modules, with examples of what they are called with."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -104,11 +105,7 @@ def _window_graph(module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str
 
 
 def _predict_example(seed: int) -> tuple[Tensor, ...]:
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+    random = partial(torch.randn, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     root = 0.004 * random(STATE_SIZE, STATE_SIZE)
     densities = 0.1 + random(2).abs()
     step = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
@@ -116,11 +113,7 @@ def _predict_example(seed: int) -> tuple[Tensor, ...]:
 
 
 def _inertial_example(seed: int) -> tuple[Tensor, ...]:
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+    random = partial(torch.randn, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     root, noise = 0.004 * random(INERTIAL_SIZE, INERTIAL_SIZE), 0.001 * random(9, 9)
     pose, mounting, turn = (exp_se3(0.3 * random(6)) for _ in range(3))
     seconds = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)

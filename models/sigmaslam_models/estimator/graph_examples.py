@@ -1,5 +1,6 @@
 """Inputs by which the graphs of the tracker's estimator are traced and checked, their names and free axes."""
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -88,13 +89,8 @@ def frame_example(seed: int, keyframes: int, count: int, *inputs: str) -> tuple[
         inputs: names, those of `FrameViews` among them.
     """
     generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
+    normal = partial(torch.randn, generator=generator, dtype=torch.float64)
+    uniform = partial(torch.rand, generator=generator, dtype=torch.float64)
     size = CALIBRATION_SIZE + 6 * (keyframes + 1)
     sigma = torch.cat(
         [torch.tensor([0.3]), torch.zeros(CALIBRATION_SIZE - 1), torch.full((size - CALIBRATION_SIZE,), 0.003)]
