@@ -18,8 +18,8 @@ from sigmaslam.slam.moving_region import MovingRegion
 from sigmaslam.two_view.scene_pose import are_one_place, see_the_same, stands_before
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
 
-# Shares of the matches, the nearest ones, that may be on what moves before the scene.
-_NEAREST = (0.2, 0.35, 0.5)
+# Shares of the matches that are farther than those that may be on what moves before the scene.
+_FARTHER = (0.8, 0.65, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,13 +107,13 @@ def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFi
     """What moves before farther landmarks, and their pose; None where nearer ones agree with that.
 
     Far parts hardly tell a translation: a body before them decides it, and all agree. The scores show it to first
-    order, at no cost; then the pose of the others is found.
+    order; only where they do the pose of the others is found, which costs as much as another fit.
     """
     window, views = localiser.window, matches.views
     rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
     disparity = window.landmarks.estimate[rows, 2]
-    for share in _NEAREST:
-        near = disparity > np.quantile(disparity[fit.inliers], 1.0 - share)
+    for least in np.quantile(disparity[fit.inliers], _FARTHER):
+        near = disparity > least
         drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
         pull = fit.scores[drawn].sum(axis=0)
         if pull @ np.linalg.lstsq(rest.T @ rest, pull, rcond=1e-14)[0] < CHI_SQUARE_9999_OF_6:
