@@ -14,8 +14,8 @@ _REGULAR = 9
 # Share of the mean interval up to which stamps are believed as they are: recordings that a sensor has stamped stay
 # below 0.02, and the motion's own noise covers more than this.
 _BELIEVED = 0.05
-# Intervals of up to so many frames are drops of a regular camera; a longer one alone is a pause, and stamps that
-# alternate by two fifths of an interval are nine times as far apart as they are close.
+# Intervals of up to so many frames are drops of a regular camera; a longer one alone is a pause. Stamps that alternate
+# by two fifths of an interval are nine times as far apart as they are close.
 _MOST_DROPPED = 4
 # Share of the intervals' variance that successive ones have in common, with the opposite sign: none where frames are
 # dropped, half for noise of stamps; above it long and short ones take turns, and no drops do that.
@@ -62,13 +62,12 @@ class FrameClock:
     the noise of stamps, by which a stamp is measured. Stamps that can be believed are taken to the bit.
 
     Attributes:
-        stretch: by what velocities are too large that were learned by a wrong interval, or 1.
         late: seconds by which the last interval is longer than usual, if the clock may have been set in it, or 0.
     """
 
     def __init__(self) -> None:
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
-        self._is_believed, self._seconds, self.late, self.stretch = True, 0.0, 0.0, 1.0
+        self._is_believed, self._seconds, self.late = True, 0.0, 0.0
 
     @property
     def interval(self) -> float:
@@ -80,25 +79,26 @@ class FrameClock:
         """The last interval is one of frames that were chosen."""
         return bool(self._intervals) and self._intervals[-1] > _SLOWEST
 
-    def tick(self, interval: float) -> tuple[float, float]:
+    def tick(self, interval: float) -> tuple[float, float, float]:
         """Takes the interval between two stamps, seconds.
 
         Returns:
-            The time between the two frames, and its standard deviation, seconds.
+            The time between the two frames, its standard deviation, seconds, and by what velocities are too large that
+            were learned by a wrong interval, or 1.
         """
         before = [*self._intervals]
         self._intervals.append(interval)
         seconds, sigma = self._estimate(np.array(self._intervals))
-        # Bursts end in long intervals, one like the other.
+        # Of bursts the longest interval is the usual one: they end in such, one like the other.
         usual = float(max(before) if sigma > 0.0 else np.median(before)) if len(before) >= _LEAST else np.inf
         self.late = interval - usual if _SET * usual < interval and usual <= _SLOWEST else 0.0
         is_other = sigma > 0.0 and (self._is_believed or self.interval > _SET * self._seconds)
-        self.stretch = self.interval / self._seconds if is_other else 1.0
+        stretch = self.interval / self._seconds if is_other else 1.0
         self._seconds, self._is_believed = seconds, sigma == 0.0
-        return seconds, sigma
+        return seconds, sigma, stretch
 
     def _estimate(self, steps: np.ndarray) -> tuple[float, float]:
-        """What `tick` returns for the last of these intervals (N,)."""
+        """Time between the last two frames and its standard deviation, by the intervals (N,) so far."""
         noise = stamp_noise(steps) if len(steps) >= _LEAST else _first_noise(steps)
         if noise == 0.0:
             return float(steps[-1]), 0.0

@@ -21,20 +21,22 @@ _MARGIN = 5
 class Frame:
     """A rectified pair. Its features, which only keyframes need, are made when they are asked for, or foreseen.
 
-    Attributes:
-        exchange: gives left and right as they are if each image is the other eye's.
-
     Args:
         left, right: (H, W) uint8, rectified.
         frontend: detects features.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
+        exchanged: gives left and right as they are if each image is the other eye's; by default as they are here.
     """
 
     def __init__(
-        self, left: np.ndarray, right: np.ndarray, frontend: Frontend, usable: np.ndarray | None = None
+        self,
+        left: np.ndarray,
+        right: np.ndarray,
+        frontend: Frontend,
+        usable: np.ndarray | None = None,
+        exchanged: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> None:
-        self.exchange: Callable[[], tuple[np.ndarray, np.ndarray]] = lambda: (right, left)
-        self._observe = frontend.observe
+        self._observe, self._exchanged = frontend.observe, exchanged or (lambda: (right, left))
         self.left = left
         self.right = right
         self.usable = usable
@@ -55,7 +57,7 @@ class Frame:
         few = int(ACCEPTANCE.exchanged_share * np.isfinite(last.disparity).sum())
         if self.view.is_swapped(min_to_judge) or self.view.has_stereo(few, min_to_judge):
             return self.view.is_swapped(min_to_judge)
-        return self._observe(*self.exchange()).has_stereo(2 * few, min_to_judge)
+        return self._observe(*self._exchanged()).has_stereo(2 * few, min_to_judge)
 
     def foresee(self, executor: Executor) -> None:
         """Begins to make the view beside the tracking of the frame."""

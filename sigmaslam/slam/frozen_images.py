@@ -43,8 +43,8 @@ class LastPairs:
             left, right: (H, W) uint8.
         """
         pair = _Probed(left), _Probed(right)
-        same, known = [False] * len(self._pairs), {row for other in self._pairs for eye in other for row in eye.rows}
-        if not known.isdisjoint(pair[0].rows + pair[1].rows):  # else no row is an old one
+        same, rows = [False] * len(self._pairs), pair[0].distinct | pair[1].distinct
+        if not all(rows.isdisjoint(eye.distinct) for other in self._pairs for eye in other):
             panels = [_rows_in_all(one, [other[eye] for other in self._pairs]) for eye, one in enumerate(pair)]
             same = [any(map(_shows, pair, other, panels)) for other in self._pairs]
         self._pairs.append(pair)
@@ -107,6 +107,7 @@ class _Probed:
         self.pixels = image.copy()
         self.step = max(len(image) // _PROBES, 1)
         self.rows = [row.tobytes() for row in self.pixels[:: self.step]]
+        self.distinct = frozenset(self.rows)
 
 
 def _rows_in_all(image: _Probed, others: list[_Probed]) -> np.ndarray:

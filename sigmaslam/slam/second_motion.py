@@ -11,6 +11,7 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.geometry.image_cells import explained_area, image_cells
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
@@ -18,8 +19,8 @@ from sigmaslam.slam.moving_region import MovingRegion
 from sigmaslam.two_view.scene_pose import are_one_place, see_the_same, stands_before
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
 
-# Shares of the matches, the nearest ones, that may be on what moves before the scene.
-_NEAREST = (0.2, 0.35, 0.5)
+# Shares of the matches that are farther than those that may be on what moves before the scene.
+_FARTHER = (0.8, 0.65, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,24 +104,36 @@ def find_second_motion(
     return SecondMotion(fit, pose, agreeing, expected[agreeing], departure, is_mover)
 
 
-def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFit) -> SecondMotion | None:
+def find_scene_behind(
+    localiser: Localiser, matches: GuidedMatches, fit: FrameFit
+) -> tuple[SecondMotion | None, np.ndarray]:
     """What moves before farther landmarks, and their pose; None where nearer ones agree with that.
 
     Far parts hardly tell a translation: a body before them decides it, and all agree. The scores show it to first
-    order, at no cost; then the pose of the others is found.
+    order; only where they do the pose of the others is found, which costs as much as another fit.
+
+    Returns:
+        The motion, and (6,) by how much nearer landmarks draw the pose along where they may move, but too little to be
+        told from what rests; perturbed from the left in the world, zero where they do not.
     """
     window, views = localiser.window, matches.views
     rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
     disparity = window.landmarks.estimate[rows, 2]
-    for share in _NEAREST:
-        near = disparity > np.quantile(disparity[fit.inliers], 1.0 - share)
+    drawn_by, most = np.zeros(6), 0.0
+    for least in np.quantile(disparity[fit.inliers], _FARTHER):
+        near = disparity > least
         drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
         pull = fit.scores[drawn].sum(axis=0)
         if pull @ np.linalg.lstsq(rest.T @ rest, pull, rcond=1e-14)[0] < CHI_SQUARE_9999_OF_6:
             continue
         others = replace(matches, views=views.select(~near), probability=matches.probability[~near])
         far = localiser.fit_near(others, prediction)
-        if far is None or not _contradicts(far, fit):
+        if far is None:
+            continue
+        squared = _squared_departure(far, fit)
+        if squared > most:
+            drawn_by, most = se3_log(far.pose @ se3_inverse(fit.pose)), squared
+        if squared <= CHI_SQUARE_9999_OF_6:
             continue
         by_fit, by_far = (seen_from(window, rows, each.pose) for each in (fit, far))
         drawn &= np.isfinite(by_far[:, 0])
@@ -129,15 +142,15 @@ def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFi
         apart = np.linalg.norm((by_far - by_fit)[drawn, :2], axis=1)
         if len(moves) >= MIN_POINTS and not see_the_same(apart):
             far = replace(far, inliers=_among(np.flatnonzero(~near)[far.inliers], len(rows)))
-            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True)
-    return None
+            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True), np.zeros(6)
+    return None, drawn_by
 
 
-def _contradicts(part: FrameFit, fit: FrameFit) -> bool:
-    """Whether the pose of a part of the matches departs from that of all by more than its own errors."""
+def _squared_departure(part: FrameFit, fit: FrameFit) -> float:
+    """Squared sigmas by which the pose of a part of the matches departs from that of all, by its own errors."""
     common = part.joint.common[-6:] - fit.joint.common[-6:]
     spread = max(part.nis_before_scaling, 1.0) * part.clustering * part.relative + common @ common.T
-    return Prediction(fit.pose, spread).excludes(part.pose)
+    return Prediction(fit.pose, spread).squared_departure(part.pose)
 
 
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:

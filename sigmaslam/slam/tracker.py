@@ -189,12 +189,12 @@ class StereoTracker:
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
-        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
-        frame.exchange = partial(self.rectifier.rectify, right, left)
+        exchanged = partial(self.rectifier.rectify, right, left)
+        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable, exchanged)
         clock.lap("rectify")
         if self._course.timestamp is not None:
-            seconds, sigma = self._clock.tick(timestamp - self._course.timestamp)
-            if (stretch := self._clock.stretch) != 1.0:
+            seconds, sigma, stretch = self._clock.tick(timestamp - self._course.timestamp)
+            if stretch != 1.0:
                 twist_sigma = initial_twist_sigma(self.config, self._window.depth)
                 self._motion.set_twist(self._motion.twist / stretch, twist_sigma)
             self._motion.predict(seconds, densities(self.config, self._window.depth), sigma, timestamp)

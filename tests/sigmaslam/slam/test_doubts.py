@@ -116,8 +116,8 @@ def test_exchanged_eyes_whose_rows_do_not_fit_are_told_from_a_dead_eye(demo: Dem
     track(tracker, frames[:3])
     left, right = frames[3].left, frames[3].right
     given = (np.roll(right, 6, axis=0), left) if is_exchanged else (left, np.zeros_like(right))
-    frame, last = Frame(*given, tracker._frontend), tracker._keyframes.active[-1].view
-    frame.exchange = lambda: (left, right) if is_exchanged else given[::-1]
+    frame = Frame(*given, tracker._frontend, exchanged=lambda: (left, right) if is_exchanged else given[::-1])
+    last = tracker._keyframes.active[-1].view
     usual = int(np.isfinite(last.disparity).sum())
     assert not frame.view.has_stereo(usual // 10, usual)
     assert frame.is_exchanged(last, usual // 2) is is_exchanged

@@ -7,14 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.image_cells import explained_area
-from sigmaslam.geometry.se3 import se3_exp, se3_inverse, transform_points
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, transform_points
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Localiser
-from sigmaslam.slam.second_motion import SecondMotion, _among, _most_departing, find_scene_behind
+from sigmaslam.slam.moving_region import MovingRegion
+from sigmaslam.slam.scrutiny import Scrutiny
+from sigmaslam.slam.second_motion import _among, _most_departing, find_scene_behind
 from sigmaslam.two_view.scene_pose import see_the_same
 from tests.support.dense_window import CAMERA, DEPTH, ITERATIONS, NO_WALK, make_window
 
@@ -41,8 +46,8 @@ def test_matches_that_stay_where_they_are_bound_nothing_else_in() -> None:
     assert not _most_departing(np.zeros(12, np.int64), np.arange(9), np.full(9, 1.0)).any()
 
 
-def drawn(seed: int, way: list[float]) -> tuple[FrameFit, SecondMotion | None]:
-    """The pose by a scene and a body before it that has gone some way, metres, and what is found to move."""
+def scene(seed: int, way: list[float]) -> tuple[Localiser, GuidedMatches, FrameFit]:
+    """Matches of a scene and of a body before it that has gone some way, metres, and the pose by all of them."""
     rng, count = np.random.default_rng(seed), FAR + NEAR
     window = make_window(np.full(3, 1e-3))
     window.add_keyframe(np.eye(4), np.eye(4), np.zeros((6, 6)), NO_WALK, DEPTH)
@@ -54,19 +59,21 @@ def drawn(seed: int, way: list[float]) -> tuple[FrameFit, SecondMotion | None]:
     points = CAMERA.triangulate(seen) + np.repeat([np.zeros(3), way], [FAR, NEAR], axis=0)
     found = CAMERA.project(transform_points(se3_inverse(POSE), points)) + rng.normal(0.0, 0.3, (count, 3))
     views = LandmarkViews(np.arange(count), found, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 2)))
-    motion: Any = SimpleNamespace(step=np.eye(4), step_covariance=np.diag(np.repeat([0.04, 0.01], 3)))
+    motion = MotionFilter()
+    motion.step_covariance[:] = np.diag(np.repeat([0.04, 0.01], 3))
     config: Any = SimpleNamespace(min_inliers=15)
     given: list[Any] = [window, motion, FrameUpdate(window, ITERATIONS), None, None, None, config, None]
     localiser, matches = Localiser(*given), GuidedMatches(views, np.ones(count), np.arange(count))
     fit = localiser.update.fit(views, np.eye(4), motion.step_covariance, 15)
     assert fit is not None
-    return fit, find_scene_behind(localiser, matches, fit)
+    return localiser, matches, fit
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_body_before_the_scene_that_draws_the_pose_along_is_found(seed: int) -> None:
     """All agree with a pose between both motions."""
-    fit, second = drawn(seed, [-0.02, 0.0, 0.0])
+    localiser, matches, fit = scene(seed, [-0.02, 0.0, 0.0])
+    second, _ = find_scene_behind(localiser, matches, fit)
     assert second is not None
     assert second.is_mover
     assert np.mean(second.agreeing >= FAR) > 0.95
@@ -76,4 +83,19 @@ def test_a_body_before_the_scene_that_draws_the_pose_along_is_found(seed: int) -
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_body_at_rest_before_the_scene_is_none_that_moves(seed: int) -> None:
-    assert drawn(seed, [0.0, 0.0, 0.0])[1] is None
+    second, drawn_by = find_scene_behind(*scene(seed, [0.0, 0.0, 0.0]))
+    assert second is None
+    assert not drawn_by.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_that_moves_by_too_little_to_be_told_is_in_the_covariance(seed: int) -> None:
+    """A pixel: nothing is left out, and the pose that the body draws along stays the frame's."""
+    localiser, matches, fit = scene(seed, [-0.006, 0.0, 0.0])
+    image = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    kept, same, doubts = Scrutiny(localiser, FrameClock(), MovingRegion(8.0, 10), False).doubt(image, matches, fit)
+    assert kept is matches
+    assert same is fit
+    error = se3_log(POSE @ se3_inverse(fit.pose))
+    assert squared_mahalanobis(error[None], fit.relative[None])[0] > 100.0
+    assert squared_mahalanobis(error[None], (fit.relative + doubts.spread)[None])[0] < 22.5
