@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.frontend import patch_kernels
-from sigmaslam.frontend.followed_patches import compare_with_neighbours
+from sigmaslam.frontend.followed_patches import compare_with_neighbours, correct_by_neighbours
 from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.frontend.motion_blur import extreme_sharpness
 from sigmaslam.frontend.patch_kernels import align_reference, examine_reference, sample
@@ -149,13 +149,20 @@ def test_images_that_are_not_there_are_refused(kernels, images):
         kernels.align([], ONE, images[1], *matches(5), 11, 3, 5.0)
 
 
-def test_compiled_medians_equal_their_twin(kernels):
-    vectors = np.random.default_rng(4).normal(size=(50, 12, 2))
-    for count in (1, 7, 12):
-        some = np.ascontiguousarray(vectors[:, :count])
-        usual = np.median(some, axis=1)
-        spread = np.median(np.linalg.norm(some - usual[:, None], axis=2), axis=1)
-        np.testing.assert_array_equal(kernels.neighbour_medians(some), np.column_stack([usual, spread]))
+@pytest.mark.parametrize("count", [2, 3, 8, 9, 13, 200])
+def test_compiled_medians_of_neighbours_equal_their_twin_to_the_bit(kernels, monkeypatch, count: int):
+    """Of even and odd numbers of neighbours, with and without slopes, and of queries that are none of the points."""
+    places, predicted, _, slope, _ = matches(count)
+    unknown = np.where(np.arange(count)[:, None] % 3 == 0, np.nan, places)
+
+    def found() -> list[np.ndarray]:
+        plain, sloped = (compare_with_neighbours(places, predicted, each) for each in (None, 100.0 * slope))
+        return [*plain, *sloped, correct_by_neighbours(predicted, unknown)]
+
+    compiled = found()
+    monkeypatch.setattr(patch_kernels, "_kernels", None)
+    for one, twin in zip(compiled, found(), strict=True):
+        np.testing.assert_array_equal(one, twin)
 
 
 TWINS = {
