@@ -41,6 +41,7 @@ constexpr int FRACTIONS = 256;   // of a pixel, that kernels are tabulated for
 constexpr int MOST_OCTAVES = 6;  // half octaves of smoothing, 0 to 5
 constexpr int MOST_TAPS = 32;
 constexpr int MOST_EXTENT = 128;  // pixels that a patch reaches over
+constexpr double MOST_ZOOM = 25.0, LEAST_CORRELATION = 0.5;  // of areas; of patches that fit
 constexpr float FLAT = 1e-2f, RIDGE = 1e-6f, NEAREST = 0.2f;
 
 struct Image {
@@ -151,27 +152,42 @@ struct Sources {
     const Image& operator[](py::ssize_t k) const { return images[which ? which[k] : 0]; }
 };
 
-// (M, 3): shift of image 1's place, and correlation there.
-py::array_t<double> align(const std::vector<Grey>& greys0, const Steps& source, const Grey& grey1, const Reals& points0,
-                          const Reals& points1, const Reals& back, const Reals& tilt, const Steps& half_octaves,
-                          int side, int iterations, double taper) {
+bool shows(const Image& image, const double* place) {
+    return place[0] >= 0.0 && place[0] <= image.width - 1 && place[1] >= 0.0 && place[1] <= image.height - 1;
+}
+
+// (M, 2) places in image 1, (M,) whether they moved, and (M,) correlation there: `align_patches`.
+py::tuple align(const std::vector<Grey>& greys0, const Steps& source, const Grey& grey1, const Reals& points0,
+                const Reals& points1, const Reals& maps, const Reals& tilts, double reach, int side, int iterations,
+                double taper) {
     const Image image1 = view(grey1);
-    const py::ssize_t count = half_octaves.size();
-    check(count, {points0.size() / 2, points1.size() / 2, back.size() / 4, tilt.size() / 2}, side);
+    const py::ssize_t count = maps.size() / 4;
+    check(count, {points0.size() / 2, points1.size() / 2, tilts.size() / 2}, side);
     const Sources images0(greys0, source, count);
-    py::array_t<double> result({count, py::ssize_t{3}});
-    double* out = result.mutable_data();
-    const double *p0 = points0.data(), *p1 = points1.data(), *b = back.data(), *t = tilt.data();
-    const int32_t* steps = half_octaves.data();
-    py::gil_scoped_release release;
-    alignas(64) float weights[MOST_SIDE * ROW] = {0};
-    window(taper, side, weights);
-    for (py::ssize_t k = 0; k < count; ++k) {
-        const Alignment found = align_one(images0[k], image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, t + 2 * k,
-                                          std::clamp(steps[k], -5, 5), side, iterations, weights);
-        out[3 * k] = found.shift_u, out[3 * k + 1] = found.shift_v, out[3 * k + 2] = found.correlation;
+    py::array_t<double> result({count, py::ssize_t{2}}), correlations(count);
+    py::array_t<bool> moves(count);
+    double *place = result.mutable_data(), *correlation = correlations.mutable_data();
+    bool* moved = moves.mutable_data();
+    const double *p0 = points0.data(), *p1 = points1.data(), *A = maps.data(), *tilt = tilts.data();
+    {
+        py::gil_scoped_release release;
+        alignas(64) float weights[MOST_SIDE * ROW] = {0};
+        window(taper, side, weights);
+        for (py::ssize_t k = 0; k < count; ++k, p0 += 2, p1 += 2, A += 4, tilt += 2, place += 2) {
+            place[0] = p1[0], place[1] = p1[1], moved[k] = false, correlation[k] = 0.0;
+            const double zoom = A[0] * A[3] - A[1] * A[2];  // of areas
+            if (!(zoom > 1.0 / MOST_ZOOM && zoom < MOST_ZOOM && shows(images0[k], p0) && shows(image1, p1))) continue;
+            const double back[4] = {A[3] / zoom, -A[1] / zoom, -A[2] / zoom, A[0] / zoom};
+            const double octaves = std::nearbyint(std::log2(zoom));
+            const Alignment found = align_one(images0[k], image1, p0, p1, back, tilt,
+                                              static_cast<int>(octaves), side, iterations, weights);
+            correlation[k] = found.correlation;
+            const double length = std::hypot(found.shift_u, found.shift_v);
+            moved[k] = correlation[k] > LEAST_CORRELATION && length <= reach * std::max(1.0, std::exp2(0.5 * octaves));
+            if (moved[k]) place[0] += found.shift_u, place[1] += found.shift_v;
+        }
     }
-    return result;
+    return py::make_tuple(result, moves, correlations);
 }
 
 // (M, 6): correlation, variance of either patch, and uu, uv, vv of the mean patch's gradients.
