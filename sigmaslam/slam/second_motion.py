@@ -112,8 +112,8 @@ def find_scene_behind(localiser: Localiser, matches: GuidedMatches, fit: FrameFi
     window, views = localiser.window, matches.views
     rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
     disparity = window.landmarks.estimate[rows, 2]
-    for share in _NEAREST:
-        near = disparity > np.quantile(disparity[fit.inliers], 1.0 - share)
+    for nearest in np.quantile(disparity[fit.inliers], 1.0 - np.array(_NEAREST)):
+        near = disparity > nearest
         drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
         pull = fit.scores[drawn].sum(axis=0)
         if pull @ np.linalg.lstsq(rest.T @ rest, pull, rcond=1e-14)[0] < CHI_SQUARE_9999_OF_6:
