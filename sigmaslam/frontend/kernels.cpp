@@ -332,18 +332,6 @@ private:
     std::vector<Point> points_;
 };
 
-// (M, count): `nearest_points`.
-py::array_t<int64_t> nearest_points(const Places& points, const Places& queries, int count) {
-    Plane plane(points, count);
-    const py::ssize_t size = queries.size() / 2;
-    py::array_t<int64_t> result({size, py::ssize_t{count}});
-    int64_t* out = result.mutable_data();
-    const float* at = queries.data();
-    py::gil_scoped_release release;
-    for (py::ssize_t k = 0; k < size; ++k) out = std::copy_n(plane.around(at + 2 * k), count, out);
-    return result;
-}
-
 // The median of an even or odd number of values: the ranks of few are counted faster than they are sorted.
 double median(const double* values, int count) {
     double low = 0.0, high = 0.0;
@@ -525,6 +513,5 @@ PYBIND11_MODULE(_kernels, module) {
     module.def("derivative_products", &derivative_products);
     module.def("fit_slopes", &fit_slopes);
     module.def("stereo_equations", &stereo_equations);
-    module.def("nearest_points", &nearest_points);
     module.def("neighbour_medians", &neighbour_medians);
 }

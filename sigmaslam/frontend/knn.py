@@ -5,8 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sigmaslam.frontend.patch_kernels import compiled
-
 # FLANN_INDEX_KDTREE_SINGLE, with OpenCV's own size of a leaf.
 _TREE: dict[str, bool | int | float | str] = {"algorithm": 4, "leaf_max_size": 10}
 # Without a limit: the neighbours are exact.
@@ -21,9 +19,6 @@ def nearest_points(points: np.ndarray, queries: np.ndarray, count: int) -> np.nd
     """
     if len(queries) == 0:
         return np.zeros((0, count), np.int64)
-    kernels = compiled()
-    if kernels is not None:
-        return np.asarray(kernels.nearest_points(points, queries, count))
     index = cv2.flann.Index(np.ascontiguousarray(points, np.float32), _TREE)
     nearest, _ = index.knnSearch(np.ascontiguousarray(queries, np.float32), count, params=_SEARCH)
     return np.asarray(nearest, np.int64)

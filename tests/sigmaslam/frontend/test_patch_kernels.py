@@ -182,6 +182,37 @@ def test_compiled_medians_of_neighbours_equal_their_twin_to_the_bit(kernels, mon
         np.testing.assert_array_equal(one, twin)
 
 
+@pytest.mark.parametrize("shape", ["a line", "two heaps far apart", "one far away"])
+def test_compiled_neighbours_in_a_box_that_is_mostly_empty_equal_their_twin(kernels, monkeypatch, shape: str):
+    rng = np.random.default_rng(3)
+    places = rng.uniform(0, 100, (300, 2)).astype(np.float32).astype(np.float64)
+    if shape == "a line":
+        places[:, 1] = 7.0
+    elif shape == "two heaps far apart":
+        places[::2] += 1e4
+    else:
+        places[17] = 1e6
+    predicted = places + rng.normal(size=places.shape)
+    found = compare_with_neighbours(places, predicted)
+    monkeypatch.setattr(patch_kernels, "_kernels", None)
+    for one, twin in zip(found, compare_with_neighbours(places, predicted), strict=True):
+        np.testing.assert_array_equal(one, twin)
+
+
+def test_points_of_neighbours_are_checked(kernels):
+    """Places that are no numbers are refused, and queries that are none lead nowhere."""
+    points, none = np.arange(10.0).reshape(5, 2), np.zeros((0, 2))
+    for value in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="finite"):
+            kernels.neighbour_medians(np.full((5, 2), value), points, points, 0, 1, points, none)
+    nowhere = np.full((1, 2), np.nan)
+    assert np.isfinite(kernels.neighbour_medians(points, nowhere, points, 0, 2, points, none)).all()
+    with pytest.raises(ValueError, match="fewer points"):
+        kernels.neighbour_medians(points, points, points, 0, 6, points, none)
+    with pytest.raises(ValueError, match="a row for each point"):
+        kernels.neighbour_medians(points, points, points[1:], 0, 1, points, none)
+
+
 TWINS = {
     "energies": lambda images: patch_energies(images[0], matches(30)[0] * 1.2 - 10.0),
     "sharpness": lambda images: np.array(extreme_sharpness(images[0])),
