@@ -19,6 +19,7 @@
 
 namespace py = pybind11;
 using Reals = py::array_t<double, py::array::c_style | py::array::forcecast>;
+using Flags = py::array_t<bool, py::array::c_style | py::array::forcecast>;
 using Integers = py::array_t<int64_t, py::array::c_style | py::array::forcecast>;
 
 #define INLINE inline __attribute__((always_inline))
@@ -198,11 +199,13 @@ py::list frame_gated(const py::dict& given) {
     const double freedom = feed.number("freedom");
     const Matrix prior = feed.matrix("prior");
     const int columns = feed.length("prior", 1);
+    // The compiled step alone takes those of the step before: where they are the same the rest is not computed.
+    const bool* inliers = given.contains("inliers") ? feed.numbers<Flags>("inliers") : nullptr;
     Step step;
     {
         py::gil_scoped_release release;
         step = (HAS_AVX2 ? wide::gated_step : plain::gated_step)(frame, offset, spread, moved, noise_scale, scale,
-                                                                 freedom, prior);
+                                                                 freedom, prior, inliers);
     }
     py::array_t<bool> agree(frame.count);
     std::copy(step.agree.begin(), step.agree.end(), agree.mutable_data());
@@ -212,6 +215,7 @@ py::list frame_gated(const py::dict& given) {
     results.append(array({step.usable}, {}));
     results.append(array(step.squared, {frame.count}));
     results.append(array({step.noise_scale}, {}));
+    if (step.scores.empty()) return results;
     results.append(column(step.offset, frame.state, 0));
     results.append(array(step.spread, frame.state, frame.state));
     results.append(array(step.moved, {frame.count, 6}));

@@ -33,6 +33,7 @@ class EstimatorGraphs:
 
     Attributes:
         predict_views, robust_step, gated_step: of a frame, see `sigmaslam_models.estimator.frame_update`.
+        is_compiled: the gated step stops where it confirms the inliers of the step before, if it is given them.
         eliminate_landmarks, gate_window, condition: of a window, see `sigmaslam_models.estimator.window_solution`.
     """
 
@@ -40,6 +41,7 @@ class EstimatorGraphs:
         self.predict_views = open_step("frame_predict", backend)
         self.robust_step = open_step("frame_robust", backend)
         self.gated_step = open_step("frame_gated", backend)
+        self.is_compiled = self.gated_step is getattr(_compiled, "frame_gated", None)
         self.eliminate_landmarks = open_step("window_eliminate", backend)
         self.gate_window = open_step("window_gate", backend)
         self.condition = load_step("window_condition", backend)

@@ -106,6 +106,8 @@ class FrameUpdate:
         for iteration in range(_GATED):
             at = {"offset": offset, "spread": spread, "moved": moved, "noise_scale": noise_scale}
             at |= {"scale": np.array(scale), "freedom": freedom, "prior": prior}
+            if inliers is not None and self._window.graphs.is_compiled:
+                at["inliers"] = inliers
             agree, count, usable, squared, noise_scale, *step = self._window.graphs.gated_step(
                 {**measured, **at, **known}
             )

@@ -204,7 +204,7 @@ class KeyframeWindow:
             if len(rows):
                 self.landmarks.covariance[rows], self.landmarks.dependence[rows], own_step = landmarks
                 self.landmarks.estimate[rows] += own_step + self.landmarks.dependence[rows] @ step
-        past = self.prior.past.given(self.prior.covariance, self.prior.common, information, vector)
+        past = self.prior.past.given(factor, self.prior.common, information, vector)
         self.posterior = replace(self.posterior, past=past)
         agree = gate_views(self, self._observations)
         if not agree.all():

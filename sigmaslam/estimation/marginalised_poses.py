@@ -156,16 +156,15 @@ class PastPoses:
         poses = nearest_rigid(se3_exp(step.reshape(-1, 6)) @ self.poses)
         return PastPoses(poses, 0.5 * (covariance + covariance.T), cross, common)
 
-    def given(self, window: np.ndarray, common: np.ndarray, information: np.ndarray, vector: np.ndarray) -> PastPoses:
+    def given(self, factor: np.ndarray, common: np.ndarray, information: np.ndarray, vector: np.ndarray) -> PastPoses:
         """Their posterior when something is learned about the window.
 
         Args:
-            window, common: (n, n), (n, 15) of its state before.
+            factor, common: (n, k), (n, 15) of its state before, whose covariance is factor factor^T.
             information, vector: (n, n), (n,) of what is learned: a factor exp(-x^T information x / 2 + vector^T x).
         """
         if not len(self):
             return self
-        factor = matrix_root(window)
         lower = np.linalg.cholesky(np.eye(len(factor.T)) + factor.T @ information @ factor)
         reduced = np.linalg.solve(lower, factor.T)
         half = np.linalg.solve(lower, factor.T @ information @ self.cross.T)

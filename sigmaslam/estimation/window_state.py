@@ -80,8 +80,8 @@ class WindowState:
             information, vector: (n, n), (n,).
             condition: `sigmaslam_models.estimator.window_solution.Condition`.
         """
-        past = self.past.given(self.covariance, self.common, information, vector)
         factor = matrix_root(self.covariance)
+        past = self.past.given(factor, self.common, information, vector)
         learned = {"factor": factor, "information": information, "vector": vector, "common": self.common}
         step, covariance, common = condition(learned)
         return replace(self.moved(step, covariance, common), past=past)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sigmaslam.frontend.knn import nearest_points
-from sigmaslam.frontend.patch_kernels import Images, align, invert_maps
+from sigmaslam.frontend.patch_kernels import Images, align, compiled, invert_maps, sources
 from sigmaslam.frontend.types import Refinement
 
 # Three matches fix a map. Where 60 % are wrong, 24 find 0.60 of the maps, 12 only 0.40 (docs/notebook, following).
@@ -106,6 +106,10 @@ def align_patches(
         taper: standard deviation of the patches' Gaussian window, radii.
         source: (M,) which of the images 0 each match comes from; None: there is one.
     """
+    kernels, tilt = compiled(), np.zeros((len(points1), 2)) if tilt is None else tilt
+    if kernels is not None:
+        images, size = sources(image0, source), (reach, 2 * radius + 1, iterations, taper * radius)
+        return AlignedPatches(*kernels.align(*images, image1, points0, points1, A, tilt, *size))
     places, moved = points1.astype(np.float64), np.zeros(len(points1), bool)
     determinant, back = invert_maps(A)
     usable = np.isfinite(determinant) & _inside(image1, points1)
@@ -113,8 +117,7 @@ def align_patches(
     rows = np.flatnonzero(usable)
     # The finer image is smoothed as much as the coarser one's pixels do, in steps of half an octave.
     half_octaves = np.round(np.log2(determinant[rows])).astype(np.int32)
-    tilts = np.zeros((len(rows), 2)) if tilt is None else tilt[rows]
-    given = points0[rows], places[rows], back[rows], tilts, half_octaves
+    given = points0[rows], places[rows], back[rows], tilt[rows], half_octaves
     of_rows = None if source is None else source[rows]
     found = align(image0, image1, *given, radius, iterations, taper, of_rows)
     shift, correlation = found[:, :2], found[:, 2]

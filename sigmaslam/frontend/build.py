@@ -37,7 +37,7 @@ def own_networks(name: str, weights: WeightsFolder, backend: str = "onnx") -> tu
 
 
 def build_frontend(
-    name: str,
+    name: Frontend | str,
     max_keypoints: int,
     backend: str = "onnx",
     threads: int = 2,
@@ -47,7 +47,7 @@ def build_frontend(
     """The front-end of that name.
 
     Args:
-        name: one of FRONTENDS.
+        name: one of FRONTENDS; or a front-end, which is taken as it is.
         max_keypoints: per image.
         backend: "onnx" or "torch", of the networks.
         threads: of the feature network.
@@ -58,6 +58,8 @@ def build_frontend(
         InputError: there is no front-end of that name, the provider is not installed, or the folder holds no network
             of this front-end, or one that does not fit.
     """
+    if not isinstance(name, str):
+        return name
     check_provider(provider, backend)
     own_networks(name, weights, backend)
     estimator = partial(ConfidenceEstimator, backend, provider, weights)

@@ -27,6 +27,8 @@ _SCALES = (4, 2)
 _CORRECTING, _MIN_CORRECTING = 7, 8
 # Neighbours that a found place is compared with.
 _COMPARED = 12
+# No slopes.
+_LEVEL = np.zeros((0, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +64,12 @@ def correct_by_neighbours(predicted: np.ndarray, start: np.ndarray) -> np.ndarra
     known = np.flatnonzero(np.isfinite(start[:, 0]))
     if len(known) < _MIN_CORRECTING:
         return predicted
-    near = known[nearest_points(predicted[known], predicted, min(_CORRECTING, len(known)))]
-    kernels, departure = compiled(), start[near] - predicted[near]
-    usual = np.median(departure, axis=1) if kernels is None else kernels.neighbour_medians(departure)[:, :2]
-    return np.asarray(predicted + usual)
+    reference, departure, count = predicted[known], start[known] - predicted[known], min(_CORRECTING, len(known))
+    kernels = compiled()
+    if kernels is not None:
+        medians = kernels.neighbour_medians(reference, predicted, departure, 0, count, reference, _LEVEL)
+        return np.asarray(predicted + medians[:, :2])
+    return np.asarray(predicted + np.median(departure[nearest_points(reference, predicted, count)], axis=1))
 
 
 def follow_flow(
@@ -143,16 +147,16 @@ def compare_with_neighbours(
     count = min(_COMPARED + 1, len(places))
     if count < 2:
         return np.zeros((len(places), 2)), np.zeros(len(places))
+    departure, kernels = places - predicted, compiled()
+    if kernels is not None:
+        slopes = _LEVEL if slope is None else slope
+        medians = kernels.neighbour_medians(places, places, departure, 1, count, predicted, slopes)
+        return departure - medians[:, :2], medians[:, 2]
     near = nearest_points(places, places, count)[:, 1:]
-    departure = places - predicted
     neighbours = departure[near]
     if slope is not None:
         apart = predicted[near] - predicted[:, None]
         neighbours[..., 0] += np.einsum("mkj,mj->mk", apart, slope)
-    kernels = compiled()
-    if kernels is not None:
-        usual, spread = np.split(kernels.neighbour_medians(neighbours), [2], axis=1)
-        return departure - usual, spread[:, 0]
     usual = np.median(neighbours, axis=1)
     spread = np.median(np.linalg.norm(neighbours - usual[:, None], axis=2), axis=1)
     return departure - usual, spread

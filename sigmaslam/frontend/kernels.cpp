@@ -13,6 +13,7 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
+#include <numeric>
 #include <stdexcept>
 #include <vector>
 
@@ -27,6 +28,7 @@ namespace py = pybind11;
 using Grey = py::array_t<uint8_t, py::array::c_style | py::array::forcecast>;
 using Reals = py::array_t<double, py::array::c_style | py::array::forcecast>;
 using Steps = py::array_t<int32_t, py::array::c_style | py::array::forcecast>;
+using Places = py::array_t<float, py::array::c_style | py::array::forcecast>;
 
 #define INLINE inline __attribute__((always_inline))
 
@@ -39,6 +41,7 @@ constexpr int FRACTIONS = 256;   // of a pixel, that kernels are tabulated for
 constexpr int MOST_OCTAVES = 6;  // half octaves of smoothing, 0 to 5
 constexpr int MOST_TAPS = 32;
 constexpr int MOST_EXTENT = 128;  // pixels that a patch reaches over
+constexpr double MOST_ZOOM = 25.0, LEAST_CORRELATION = 0.5;  // of areas; of patches that fit
 constexpr float FLAT = 1e-2f, RIDGE = 1e-6f, NEAREST = 0.2f;
 
 struct Image {
@@ -149,27 +152,42 @@ struct Sources {
     const Image& operator[](py::ssize_t k) const { return images[which ? which[k] : 0]; }
 };
 
-// (M, 3): shift of image 1's place, and correlation there.
-py::array_t<double> align(const std::vector<Grey>& greys0, const Steps& source, const Grey& grey1, const Reals& points0,
-                          const Reals& points1, const Reals& back, const Reals& tilt, const Steps& half_octaves,
-                          int side, int iterations, double taper) {
+bool shows(const Image& image, const double* place) {
+    return place[0] >= 0.0 && place[0] <= image.width - 1 && place[1] >= 0.0 && place[1] <= image.height - 1;
+}
+
+// (M, 2) places in image 1, (M,) whether they moved, and (M,) correlation there: `align_patches`.
+py::tuple align(const std::vector<Grey>& greys0, const Steps& source, const Grey& grey1, const Reals& points0,
+                const Reals& points1, const Reals& maps, const Reals& tilts, double reach, int side, int iterations,
+                double taper) {
     const Image image1 = view(grey1);
-    const py::ssize_t count = half_octaves.size();
-    check(count, {points0.size() / 2, points1.size() / 2, back.size() / 4, tilt.size() / 2}, side);
+    const py::ssize_t count = maps.size() / 4;
+    check(count, {points0.size() / 2, points1.size() / 2, tilts.size() / 2}, side);
     const Sources images0(greys0, source, count);
-    py::array_t<double> result({count, py::ssize_t{3}});
-    double* out = result.mutable_data();
-    const double *p0 = points0.data(), *p1 = points1.data(), *b = back.data(), *t = tilt.data();
-    const int32_t* steps = half_octaves.data();
-    py::gil_scoped_release release;
-    alignas(64) float weights[MOST_SIDE * ROW] = {0};
-    window(taper, side, weights);
-    for (py::ssize_t k = 0; k < count; ++k) {
-        const Alignment found = align_one(images0[k], image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, t + 2 * k,
-                                          std::clamp(steps[k], -5, 5), side, iterations, weights);
-        out[3 * k] = found.shift_u, out[3 * k + 1] = found.shift_v, out[3 * k + 2] = found.correlation;
+    py::array_t<double> result({count, py::ssize_t{2}}), correlations(count);
+    py::array_t<bool> moves(count);
+    double *place = result.mutable_data(), *correlation = correlations.mutable_data();
+    bool* moved = moves.mutable_data();
+    const double *p0 = points0.data(), *p1 = points1.data(), *A = maps.data(), *tilt = tilts.data();
+    {
+        py::gil_scoped_release release;
+        alignas(64) float weights[MOST_SIDE * ROW] = {0};
+        window(taper, side, weights);
+        for (py::ssize_t k = 0; k < count; ++k, p0 += 2, p1 += 2, A += 4, tilt += 2, place += 2) {
+            place[0] = p1[0], place[1] = p1[1], moved[k] = false, correlation[k] = 0.0;
+            const double zoom = A[0] * A[3] - A[1] * A[2];  // of areas
+            if (!(zoom > 1.0 / MOST_ZOOM && zoom < MOST_ZOOM && shows(images0[k], p0) && shows(image1, p1))) continue;
+            const double back[4] = {A[3] / zoom, -A[1] / zoom, -A[2] / zoom, A[0] / zoom};
+            const double octaves = std::nearbyint(std::log2(zoom));
+            const Alignment found = align_one(images0[k], image1, p0, p1, back, tilt,
+                                              static_cast<int>(octaves), side, iterations, weights);
+            correlation[k] = found.correlation;
+            const double length = std::hypot(found.shift_u, found.shift_v);
+            moved[k] = correlation[k] > LEAST_CORRELATION && length <= reach * std::max(1.0, std::exp2(0.5 * octaves));
+            if (moved[k]) place[0] += found.shift_u, place[1] += found.shift_v;
+        }
     }
-    return result;
+    return py::make_tuple(result, moves, correlations);
 }
 
 // (M, 6): correlation, variance of either patch, and uu, uv, vv of the mean patch's gradients.
@@ -234,51 +252,159 @@ py::array_t<double> derivative_products(const Grey& grey, const Taps& taps) {
     return result;
 }
 
-// The median of an even or odd number of values, which it puts in another order.
-double median(double* values, int count) {
-    double* middle = values + count / 2;
-    std::nth_element(values, middle, values + count);
-    return count % 2 ? *middle : (*std::max_element(values, middle) + *middle) / 2.0;
+// Points of the plane in square cells of a few each: those around a query are looked at ring by ring.
+class Plane {
+public:
+    Plane(const Places& points, int nearest) : nearest_(nearest), found_(nearest), squared_(nearest) {
+        if (points.ndim() != 2 || points.shape(1) != 2) throw std::invalid_argument("points must be (N, 2)");
+        const int count = static_cast<int>(points.shape(0));
+        if (nearest < 1 || nearest > count) throw std::invalid_argument("there are fewer points");
+        const float* from = points.data();
+        float high[2] = {from[0], from[1]};
+        low_[0] = from[0], low_[1] = from[1];
+        for (int k = 0; k < 2 * count; ++k) {
+            low_[k % 2] = std::min(low_[k % 2], from[k]), high[k % 2] = std::max(high[k % 2], from[k]);
+        }
+        const float wide = high[0] - low_[0], tall = high[1] - low_[1];
+        if (!std::isfinite(wide + tall)) throw std::invalid_argument("points must be finite");
+        // Not more cells than points, however thin the box is.
+        side_ = std::max({std::sqrt(POINTS * wide * tall / count), std::max(wide, tall) / count, 1e-6f});
+        cells_[0] = 1 + static_cast<int>(wide / side_), cells_[1] = 1 + static_cast<int>(tall / side_);
+        begin_.assign(cells_[0] * cells_[1] + 1, 0);
+        for (int k = 0; k < count; ++k) ++begin_[cell_of(from + 2 * k) + 1];
+        std::partial_sum(begin_.begin(), begin_.end(), begin_.begin());
+        points_.resize(count);
+        std::vector<int> next(begin_.begin(), begin_.end() - 1);
+        for (int k = 0; k < count; ++k) points_[next[cell_of(from + 2 * k)]++] = {from[2 * k], from[2 * k + 1], k};
+    }
+
+    // The nearest points to a place (u, v) by their numbers, the nearest first.
+    const int* around(const float* place) {
+        const int column = cell_of(place, 0), row = cell_of(place, 1);
+        int size = 0;
+        for (int ring = 0;; ++ring) {
+            for (int r = std::max(row - ring, 0); r <= std::min(row + ring, cells_[1] - 1); ++r) {
+                const int step = std::abs(r - row) == ring ? 1 : 2 * ring;  // of the rows between, the two ends
+                for (int c = column - ring; c <= column + ring; c += step)
+                    if (c >= 0 && c < cells_[0]) look_at(r * cells_[0] + c, place, size);
+            }
+            float reached = INFINITY;  // by all that was looked at
+            for (int axis = 0; axis < 2; ++axis) {
+                const int at = axis ? row : column;
+                if (at > ring) reached = std::min(reached, place[axis] - (low_[axis] + (at - ring) * side_));
+                if (at + ring + 1 < cells_[axis])
+                    reached = std::min(reached, low_[axis] + (at + ring + 1) * side_ - place[axis]);
+            }
+            reached *= 0.999f;  // rounding
+            if (reached == INFINITY || (size == nearest_ && reached > 0.f && squared_[size - 1] < reached * reached))
+                return found_.data();
+        }
+    }
+
+private:
+    static constexpr float POINTS = 3.f;  // of a cell
+
+    struct Point {
+        float u, v;
+        int index;
+    };
+
+    int cell_of(const float* place, int axis) const {
+        const float cell = (place[axis] - low_[axis]) / side_;
+        return cell > 0.f ? static_cast<int>(std::min(cell, cells_[axis] - 1.f)) : 0;  // NaN is nowhere
+    }
+    int cell_of(const float* place) const { return cell_of(place, 1) * cells_[0] + cell_of(place, 0); }
+
+    void look_at(int cell, const float* place, int& size) {
+        for (int i = begin_[cell]; i < begin_[cell + 1]; ++i) {
+            const float du = points_[i].u - place[0], dv = points_[i].v - place[1], square = du * du + dv * dv;
+            if (size == nearest_ && square >= squared_[size - 1]) continue;
+            int k = size < nearest_ ? size++ : size - 1;
+            for (; k > 0 && squared_[k - 1] > square; --k) squared_[k] = squared_[k - 1], found_[k] = found_[k - 1];
+            squared_[k] = square, found_[k] = points_[i].index;
+        }
+    }
+
+    int nearest_, cells_[2];
+    float low_[2], side_;
+    std::vector<int> begin_, found_;
+    std::vector<float> squared_;
+    std::vector<Point> points_;
+};
+
+// The median of an even or odd number of values: the ranks of few are counted faster than they are sorted.
+double median(const double* values, int count) {
+    double low = 0.0, high = 0.0;
+    for (int i = 0; i < count; ++i) {
+        int rank = 0;
+        for (int j = 0; j < i; ++j) rank += values[j] <= values[i];
+        for (int j = i + 1; j < count; ++j) rank += values[j] < values[i];
+        if (rank == (count - 1) / 2) low = values[i];
+        if (rank == count / 2) high = values[i];
+    }
+    return (low + high) / 2.0;
 }
 
-// (M, 3): median (u, v) of the vectors of near ones, and the median distance of these from that.
-py::array_t<double> neighbour_medians(const Reals& vectors) {
-    if (vectors.ndim() != 3 || vectors.shape(2) != 2) throw std::invalid_argument("vectors must be (M, K, 2)");
-    const py::ssize_t count = vectors.shape(0);
-    const int near = static_cast<int>(vectors.shape(1));
-    py::array_t<double> result({count, py::ssize_t{3}});
-    const double* from = vectors.data();
+// (M, 3): median (u, v) of the departures (N, 2) of the points nearest to each query but for the first ones, and the
+// median distance of these from that. With slopes (M, 2) a departure along u grows with the distance of starts (N, 2).
+py::array_t<double> neighbour_medians(const Places& points, const Places& queries, const Reals& departures, int first,
+                                      int count, const Reals& starts, const Reals& slopes) {
+    const py::ssize_t size = queries.size() / 2;
+    if (departures.size() != points.size() || count <= first || first < 0 || starts.size() != points.size() ||
+        (slopes.size() && (slopes.size() != 2 * size || points.size() != 2 * size)))
+        throw std::invalid_argument("all arrays must have a row for each point");
+    Plane plane(points, count);
+    py::array_t<double> result({size, py::ssize_t{3}});
+    const double *from = departures.data(), *start = starts.data(), *slope = slopes.size() ? slopes.data() : nullptr;
+    const float* at = queries.data();
     double* out = result.mutable_data();
     py::gil_scoped_release release;
-    std::vector<double> values(near);
-    for (py::ssize_t k = 0; near && k < count; ++k, from += 2 * near, out += 3) {
-        for (int axis = 0; axis < 2; ++axis) {
-            for (int i = 0; i < near; ++i) values[i] = from[2 * i + axis];
-            out[axis] = median(values.data(), near);
-        }
+    const int near = count - first;
+    std::vector<double> us(near), vs(near), distances(near);
+    for (py::ssize_t k = 0; k < size; ++k, out += 3) {
+        const int* number = plane.around(at + 2 * k) + first;
         for (int i = 0; i < near; ++i) {
-            const double u = from[2 * i] - out[0], v = from[2 * i + 1] - out[1];
-            values[i] = std::sqrt(u * u + v * v);
+            us[i] = from[2 * number[i]], vs[i] = from[2 * number[i] + 1];
+            if (slope)
+                us[i] += (start[2 * number[i]] - start[2 * k]) * slope[2 * k] +
+                         (start[2 * number[i] + 1] - start[2 * k + 1]) * slope[2 * k + 1];
         }
-        out[2] = median(values.data(), near);
+        out[0] = median(us.data(), near), out[1] = median(vs.data(), near);
+        for (int i = 0; i < near; ++i) {
+            const double u = us[i] - out[0], v = vs[i] - out[1];
+            distances[i] = std::sqrt(u * u + v * v);
+        }
+        out[2] = median(distances.data(), near);
     }
     return result;
 }
 
-// (K, 2): gradients of a disparity that rises by (K, N) towards neighbours (K, N, 2) pixels apart: `disparity_slopes`.
-py::array_t<double> fit_slopes(const Reals& offsets, const Reals& rises, double rough, double steep,
-                               const std::vector<double>& scales) {
-    if (rises.ndim() != 2 || offsets.size() != 2 * rises.size()) throw std::invalid_argument("rises must be (K, N)");
-    const py::ssize_t count = rises.shape(0), near = rises.shape(1);
+// (K, 2): gradients of the disparity (N,) around some of the points (N, 2) by their nearest others: `disparity_slopes`.
+py::array_t<double> fit_slopes(const Reals& points, const Reals& disparities, const Steps& chosen, int near, double rough,
+                               double steep, const std::vector<double>& scales) {
+    if (points.size() != 2 * disparities.size()) throw std::invalid_argument("all arrays must have a row for each point");
+    Plane plane(Places(points), near + 1);
+    const py::ssize_t count = chosen.size();
     py::array_t<double> result({count, py::ssize_t{2}});
-    const double *apart = offsets.data(), *rise = rises.data();
+    const double *at = points.data(), *disparity = disparities.data();
+    const int32_t* which = chosen.data();
+    for (py::ssize_t k = 0; k < count; ++k)
+        if (which[k] < 0 || which[k] >= disparities.size()) throw std::invalid_argument("there is no point of that number");
     double* out = result.mutable_data();
     py::gil_scoped_release release;
-    for (py::ssize_t k = 0; k < count; ++k, apart += 2 * near, rise += near, out += 2) {
+    std::vector<double> apart(2 * near), rise(near);
+    for (py::ssize_t k = 0; k < count; ++k, out += 2) {
+        const double *own = at + 2 * which[k], height = disparity[which[k]];
+        const float place[2] = {static_cast<float>(own[0]), static_cast<float>(own[1])};
+        const int* number = plane.around(place) + 1;
+        for (int i = 0; i < near; ++i) {
+            apart[2 * i] = at[2 * number[i]] - own[0], apart[2 * i + 1] = at[2 * number[i] + 1] - own[1];
+            rise[i] = disparity[number[i]] - height;
+        }
         out[0] = out[1] = 0.0;
         for (const double scale : scales) {
             double uu = 1.0 / (steep * steep), vv = uu, uv = 0.0, u = 0.0, v = 0.0;
-            for (py::ssize_t i = 0; i < near; ++i) {
+            for (int i = 0; i < near; ++i) {
                 const double du = apart[2 * i], dv = apart[2 * i + 1];
                 const double rest = (rise[i] - (du * out[0] + dv * out[1])) / (rough * scale);
                 const double bend = (1.0 + rest * rest) * rough, weight = 1.0 / (bend * bend);

@@ -62,8 +62,9 @@ def extract(graph: Graph, image: np.ndarray, max_keypoints: int) -> Features:
     bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
     padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
     count = np.array(min(max_keypoints, padded.size // _PIXELS_PER_KEYPOINT), np.int64)
-    feed = {"image": padded[None, None].astype(np.float32) / 255.0, "count": count}
-    keypoints, scores, descriptors, sigma = graph(feed)
+    shades = padded[None, None].astype(np.float32)
+    shades /= 255.0
+    keypoints, scores, descriptors, sigma = graph({"image": shades, "count": count})
     # The padding contains no corners, but its seam may.
     inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
     kept = np.flatnonzero((scores > 0) & inside)

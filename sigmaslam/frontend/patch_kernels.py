@@ -60,6 +60,8 @@ def align(
 ) -> np.ndarray:
     """Inverse compositional Lucas-Kanade over a shift (Baker & Matthews 2004), gain and offset of grey values free.
 
+    In NumPy; the compiled twin is that of `affine_alignment.align_patches`, which is all that needs it.
+
     Args:
         image0, image1: (H, W) uint8; of image 0 there may be several.
         points0, points1: (M, 2) float64 matched pixels, inside the images.
@@ -73,13 +75,8 @@ def align(
     Returns:
         (M, 3) float64: shift of the place in image 1, pixels, and the correlation of the patches there.
     """
-    kernels = compiled()
     rows = points0, points1, back, tilt, half_octaves
-    if kernels is None:
-        return _by_source(align_reference, image0, source, image1, rows, (radius, iterations, taper))
-    images = _sources(image0, source)
-    found: np.ndarray = kernels.align(*images, image1, *rows, 2 * radius + 1, iterations, taper * radius)
-    return found
+    return _by_source(align_reference, image0, source, image1, rows, (radius, iterations, taper))
 
 
 def examine(
@@ -104,7 +101,7 @@ def examine(
     rows = points0, points1, back, half_octaves
     if kernels is None:
         return _by_source(examine_reference, image0, source, image1, rows, (radius, taper, flat))
-    found: np.ndarray = kernels.examine(*_sources(image0, source), image1, *rows, 2 * radius + 1, taper * radius, flat)
+    found: np.ndarray = kernels.examine(*sources(image0, source), image1, *rows, 2 * radius + 1, taper * radius, flat)
     return found
 
 
@@ -129,7 +126,7 @@ def compiled() -> ModuleType | None:
     return _kernels
 
 
-def _sources(image0: Images, source: np.ndarray | None) -> tuple[list[np.ndarray], np.ndarray]:
+def sources(image0: Images, source: np.ndarray | None) -> tuple[list[np.ndarray], np.ndarray]:
     """Images and numbers as the compiled functions take them."""
     images = [image0] if isinstance(image0, np.ndarray) else list(image0)
     return images, np.zeros(0, np.int32) if source is None else source

@@ -51,12 +51,12 @@ def disparity_slopes(points: np.ndarray, disparity: np.ndarray, wanted: np.ndarr
         return slope
     points, disparity = points[known].astype(np.float64), disparity[known]
     chosen = np.arange(len(known)) if wanted is None else np.flatnonzero(np.isin(known, wanted))
-    near = nearest_points(points, points[chosen], min(_NEIGHBOURS + 1, len(points)))[:, 1:]
-    apart, rise = points[near] - points[chosen, None], disparity[near] - disparity[chosen, None]
-    kernels = compiled()
+    neighbours, kernels = min(_NEIGHBOURS, len(points) - 1), compiled()
     if kernels is not None:
-        slope[known[chosen]] = kernels.fit_slopes(apart, rise, _ROUGH, _STEEP, _SCALES)
+        slope[known[chosen]] = kernels.fit_slopes(points, disparity, chosen, neighbours, _ROUGH, _STEEP, _SCALES)
         return slope
+    near = nearest_points(points, points[chosen], neighbours + 1)[:, 1:]
+    apart, rise = points[near] - points[chosen, None], disparity[near] - disparity[chosen, None]
     fitted = np.zeros((len(chosen), 2))
     for scale in _SCALES:
         rest = (rise - (apart @ fitted[..., None])[..., 0]) / _ROUGH

@@ -14,11 +14,12 @@ class Deferred(Generic[T]):
 
     Args:
         make: gives the value.
+        executor: begins at once to make it beside what goes on, if there is one.
     """
 
-    def __init__(self, make: Callable[[], T]) -> None:
+    def __init__(self, make: Callable[[], T], executor: Executor | None = None) -> None:
         self._make = make
-        self._coming: Future[T] | None = None
+        self._coming: Future[T] | None = None if executor is None else executor.submit(make)
         self._made: list[T] = []
 
     def begin(self, executor: Executor) -> None:

@@ -93,9 +93,7 @@ class Keyframes:
         self, view: StereoView, timestamp: float, blur: float = 1.0, landmarks: np.ndarray | slice = slice(None)
     ) -> None:
         """Takes the newest keyframe of the window, with its blur and which of its features (K,) are landmarks."""
-        dense = Deferred(lambda: dense_disparity(view))
-        if self._executor is not None:
-            dense.begin(self._executor)
+        dense = Deferred(lambda: dense_disparity(view), self._executor)
         energies = np.zeros((len(view.features.keypoints), 2))
         energies[landmarks] = patch_energies(view.left, view.features.keypoints[landmarks])
         self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, dense))

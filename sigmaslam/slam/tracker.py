@@ -30,6 +30,7 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.slam.argument_checks import check_frame, check_sample, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame, usable_pixels
@@ -111,24 +112,24 @@ class StereoTracker:
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         self._turn, self.config = Lock(), (config := config or TrackerConfig())
+        self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
+        networks = config.max_keypoints, backend, threads, provider, weights
+        loading = Deferred(lambda: build_frontend(frontend, *networks), self._beside)
         self.rectifier = StereoRectifier(camera)
         self._camera = rectified = self.rectifier.rectified
-        self._T_rectified_left = self.rectifier.T_rectified_left
-        if isinstance(frontend, str):
-            frontend = build_frontend(frontend, config.max_keypoints, backend, threads, provider, weights)
-        self._frontend = frontend
+        self._T_rectified_left = turned = self.rectifier.T_rectified_left
         self._blas = ThreadpoolController()
-        self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         self._admission = admission = admission or AdmitAll(config.min_inliers, config.spacing)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
         by_check = np.isin(ERRORS, ("offset", *TURNS)) * (disparity_error or 0.0)
         self._window = window = KeyframeWindow(rectified, prior.widened(by_check), graphs, usual=prior)
         self._noise = noise = MeasurementNoise(config)
-        self._motion = motion = build_motion(backend, imu, odometry, self._T_rectified_left)
+        self._motion = motion = build_motion(backend, imu, odometry, turned)
         self._course = course = Course()
         self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
+        self._frontend = frontend = loading.get()
         update = FrameUpdate(window, config.iterations)
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
@@ -139,12 +140,11 @@ class StereoTracker:
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, motion, unguided, admission, config.min_inliers)
-        origin = None if start is None else start.of_rectified(self._T_rectified_left)
+        origin = None if start is None else start.of_rectified(turned)
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config, origin)
-        relative_poses = RelativePoseReporter(self._T_rectified_left, window, keyframes, motion)
-        self._reporter = Reporter(self._T_rectified_left, window, motion, relative_poses)
+        self._reporter = Reporter(turned, window, motion, RelativePoseReporter(turned, window, keyframes, motion))
         self.last_frame: MatchedFrame | None = None
-        self._history = FrameHistory(window, keyframes, self._T_rectified_left)
+        self._history = FrameHistory(window, keyframes, turned)
 
     def load_map(self, path: Path) -> None:
         """Takes the world of a map that `sigmaslam track` has written; tracking starts where a view is found in it.

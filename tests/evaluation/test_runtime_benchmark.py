@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sigmaslam
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.readers import open_sequence
@@ -31,6 +32,14 @@ def pairs(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Deco
     sequence = open_sequence(demo_sequence)
     with closing(sequence.frames()) as frames:
         return write_pairs(tmp_path_factory.mktemp("pairs"), islice(frames, FRAMES), sequence.camera)
+
+
+@pytest.fixture(autouse=True)
+def compiled_folders(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Those that would be compiled to bytecode, which takes seconds."""
+    folders: list[str] = []
+    monkeypatch.setattr(runtime.compileall, "compile_dir", lambda folder, **_: folders.append(folder))
+    return folders
 
 
 def _timing(cpu_ms: float, version: str = "") -> MethodTiming:
@@ -67,6 +76,11 @@ def test_a_resized_camera_sees_the_same_rays(pairs: DecodedPairs, tmp_path: Path
     corner = np.array([[-0.5, -0.5]])
     np.testing.assert_allclose(half.rectified.rays(corner), pairs.rectified.rays(corner))
     assert half.rectified.focal_baseline == pytest.approx(0.5 * pairs.rectified.focal_baseline)
+
+
+def test_methods_start_from_bytecode_as_where_they_are_installed(compiled_folders: list[str]):
+    assert isinstance(next(time_everything(None, ["ours"], ["kitti_raw_0926_0039_a"])), Omission)
+    assert compiled_folders == [str(Path(sigmaslam.__file__).parent)]
 
 
 @pytest.mark.long

@@ -152,13 +152,13 @@ def test_wheels_for_many_linux_are_of_their_machines(tmp_path: Path):
     code = (
         "import numpy, sigmaslam.estimation._estimator as estimator, sigmaslam.frontend._kernels as kernels\n"
         "print(kernels.__file__, estimator.__file__, estimator.FAST)\n"
-        "kernels.neighbour_medians(numpy.zeros(3))"
+        "kernels.fit_slopes(numpy.zeros(3), numpy.zeros(3), [0], 1, 1.0, 1.0, [1.0])"
     )
     command = [sys.executable, "-c", code]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / platform.machine())}
     ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     # An exception has its kind, whichever module was loaded first.
-    assert ran.stderr.splitlines()[-1] == "ValueError: vectors must be (M, K, 2)"
+    assert ran.stderr.splitlines()[-1] == "ValueError: all arrays must have a row for each point"
     assert ran.stdout.count(str(tmp_path)) == 2
     assert ran.stdout.endswith("True\n")
 

@@ -61,6 +61,18 @@ def test_compiled_step_repeats_to_the_bit(name, inputs):
         assert a.tobytes() == b.tobytes()
 
 
+def test_gated_step_stops_where_it_confirms_the_inliers(inputs):
+    step, feed = open_step("frame_gated"), list(feeds("frame_gated", inputs))[1]
+    whole = step(feed)
+    stopped = step({**feed, "inliers": whole[0]})
+    assert len(stopped) == 5 < len(whole)
+    contradicted = step({**feed, "inliers": ~whole[0]})
+    for some in (stopped, contradicted):
+        for a, b in zip(some, whole, strict=False):
+            assert a.tobytes() == b.tobytes()
+    assert len(contradicted) == len(whole)
+
+
 @pytest.mark.long
 def test_view_source_is_that_of_the_modules():
     written = Path(sigmaslam.estimation.__file__).with_name("views.inc").read_text()

@@ -2,7 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Event
+from threading import Event, current_thread
 from typing import Any
 from unittest import mock
 
@@ -12,8 +12,10 @@ import pytest
 import sigmaslam
 from sigmaslam.bodies.object_tracker import ObjectTracker
 from sigmaslam.errors import FrameError, InputError
+from sigmaslam.frontend import build_frontend
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.stereo_sequence import StereoFrame
+from sigmaslam.slam import tracker as tracker_module
 from sigmaslam.slam.argument_checks import check_frame
 from sigmaslam.slam.tracker import StereoTracker
 
@@ -191,3 +193,24 @@ def test_a_wrong_region_is_refused(demo_sequence: Path, region: Any, words: str)
 def test_wrong_options_of_match_images_are_refused(options: dict[str, Any], words: str):
     with pytest.raises(InputError, match=words):
         sigmaslam.match_images(IMAGE, IMAGE, **{"frontend": "sift", **options})
+
+
+@pytest.mark.parametrize(("threads", "name"), [(1, "MainThread"), (2, "keyframe")])
+def test_networks_are_loaded_beside_what_else_a_start_needs(
+    demo_sequence: Path, monkeypatch: pytest.MonkeyPatch, threads: int, name: str
+):
+    camera, loaded = open_sequence(demo_sequence).camera, []
+
+    def load(*arguments: Any) -> Any:
+        loaded.append((current_thread().name, build_frontend(*arguments)))
+        return loaded[-1][1]
+
+    monkeypatch.setattr(tracker_module, "build_frontend", load)
+    tracker = StereoTracker(camera, "orb", threads=threads)
+    assert len(loaded) == 1
+    assert loaded[0][0].startswith(name)
+    assert tracker._frontend is loaded[0][1]
+    # One that is given is taken as it is, and what is wrong is said as if it had not been beside.
+    assert StereoTracker(camera, tracker._frontend, threads=threads)._frontend is tracker._frontend
+    with pytest.raises(InputError, match="cuda"):
+        StereoTracker(camera, provider="cuda", threads=threads)
