@@ -43,8 +43,8 @@ def truth_errors(
         kind: of the truth; None: guessed.
         given: sigmas of each coordinate, metres, and about each axis, degrees, in place of the kind's.
     """
-    known, reason = (kind, "") if kind or None not in given else guess_truth_kind(path, truth)
-    usual = TRUTH_SIGMAS[known or "exact"]
+    known, reason = (kind or "exact", "") if kind or None not in given else guess_truth_kind(path, truth)
+    usual = TRUTH_SIGMAS[known]
     position, rotation = (own if said is None else said for own, said in zip(usual, given, strict=True))
     covariance, unrelated_after = truth_covariance(position, rotation), 0.0
     if known == "gps" and given[0] is None:
