@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sigmaslam_evaluation.metrics.map_consistency import coverage
 from sigmaslam_evaluation.metrics.relative_consistency import SpanConsistency
-from sigmaslam_evaluation.metrics.trajectory_errors import AbsoluteError, KittiErrors, PoseNees, RelativeError
+from sigmaslam_evaluation.metrics.trajectory_errors import AbsoluteError, KittiErrors, PoseNees, RelativeError, coverage
 from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.relative_summary import span_to_dict
 

@@ -1,8 +1,7 @@
 """An evaluation as a table of text."""
 
 from sigmaslam_evaluation.evaluation_result import Evaluation, FinalErrors
-from sigmaslam_evaluation.metrics.map_consistency import coverage
-from sigmaslam_evaluation.metrics.trajectory_errors import PoseNees
+from sigmaslam_evaluation.metrics.trajectory_errors import PoseNees, coverage
 from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.relative_summary import format_relative
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, read_text
 from sigmaslam.errors import InputError
-from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
+from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import has_matplotlib
 from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
@@ -31,7 +31,7 @@ from sigmaslam_evaluation.metrics.trajectory_errors import (
     relative_pose_error,
     synchronise,
 )
-from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
+from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors
 from sigmaslam_evaluation.truth_conventions import (
     TruthConvention,
     describe_mirror,
@@ -40,13 +40,7 @@ from sigmaslam_evaluation.truth_conventions import (
     find_truth,
     scale_times,
 )
-from sigmaslam_evaluation.truth_errors import (
-    KIND_WORDS,
-    TRUTH_SIGMAS,
-    TruthKind,
-    guess_truth_kind,
-    leave_out_interpolated,
-)
+from sigmaslam_evaluation.truth_errors import TruthKind, leave_out_interpolated, truth_errors
 
 _LOGGER = logging.getLogger(__name__)
 # An error is of poses relative to others.
@@ -120,15 +114,14 @@ def evaluate_run(
     hint = None if other is None else other.describe()
     if other is None and not follows_object:
         hint = describe_mirror(estimate, true)
-    sigmas, guess = _truth_sigmas(truth, true, truth_kind, (truth_sigma_position, truth_sigma_rotation))
-    exact = max(sigmas) == 0.0
-    of_truth = None if exact else truth_covariance(*sigmas)
-    true, left_out = (true, None) if exact else leave_out_interpolated(estimate, true)
+    kept, left_out = leave_out_interpolated(estimate, true)
+    of_truth, guess = truth_errors(truth, kept, truth_kind, (truth_sigma_position, truth_sigma_rotation))
+    true, left_out = (true, None) if of_truth is None else (kept, left_out)
     relative = _judge_relative_poses(run_or_trajectory, estimate, true, of_truth, follows_object) if is_run else None
     if follows_object:
         T_body_followed = _followed_frame(estimate, true)
         true = Trajectory(true.timestamps, true.poses @ T_body_followed)
-        of_truth = None if of_truth is None else turn_covariance(se3_inverse(T_body_followed), of_truth)
+        of_truth = None if of_truth is None else of_truth.turned(se3_inverse(T_body_followed))
     covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
     matched_estimate, matched_truth = synchronise(estimate, true)
     predicted = np.zeros(len(estimate), bool) if frames is None else predicted_poses(frames, estimate.timestamps)
@@ -164,40 +157,22 @@ def evaluate_run(
     return evaluation
 
 
-def _truth_sigmas(
-    path: Path, truth: Trajectory, kind: TruthKind | None, given: tuple[float | None, float | None]
-) -> tuple[tuple[float, float], str | None]:
-    """Metres and degrees, and what is said where the kind is guessed."""
-    if given[0] is not None and given[1] is not None:
-        return (given[0], given[1]), None
-    known, reason = (kind, "") if kind else guess_truth_kind(path, truth)
-    position, rotation = (own if said is None else said for own, said in zip(TRUTH_SIGMAS[known], given, strict=True))
-    if kind:
-        return (position, rotation), None
-    errors = f"sigma {position:g} m and {rotation:g} deg" if known != "exact" else "without errors"
-    return (position, rotation), (
-        f"is taken for {KIND_WORDS[known]}, {errors}, as {reason}: --truth-kind, or --truth-sigma-position and "
-        "--truth-sigma-rotation, say it better"
-    )
-
-
 def _judge_relative_poses(
-    run: Path, estimate: Trajectory, truth: Trajectory, of_truth: np.ndarray | None, follows_object: bool
+    run: Path, estimate: Trajectory, truth: Trajectory, of_truth: TruthErrors | None, follows_object: bool
 ) -> tuple[SpanConsistency, ...] | None:
     """Consistency of the camera's poses relative to earlier ones; of a followed body's run in the body's frame."""
     path = run / RELATIVE_POSES_NAME
     if not path.is_file():
         return None
     pairs = read_frame_pairs(path, len(estimate))
-    covariances = None if of_truth is None else np.tile(of_truth, (len(truth), 1, 1))
     if follows_object:
-        covariances = covariances if covariances is None else turn_covariance(truth.poses, covariances)
+        of_truth = None if of_truth is None else of_truth.turned(truth.poses)
         truth = Trajectory(truth.timestamps, se3_inverse(truth.poses))
-    return relative_consistency(pairs, estimate, truth, covariances)
+    return relative_consistency(pairs, estimate, truth, of_truth)
 
 
 def _evaluate_final(
-    run: Path, estimate: Trajectory, truth: Trajectory, of_truth: np.ndarray | None
+    run: Path, estimate: Trajectory, truth: Trajectory, of_truth: TruthErrors | None
 ) -> FinalErrors | None:
     """The errors after the fact, of a run that has them; the trajectories are in the clock of the truth."""
     path = run / FINAL_TRAJECTORY

@@ -1,5 +1,6 @@
 """How good a truth is: its kind, the errors of this kind, and poses that nobody measured."""
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -9,11 +10,17 @@ from sigmaslam.geometry.se3 import rotation_log, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import trajectory_format
 from sigmaslam_evaluation.metrics.trajectory_errors import synchronise
+from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors, truth_covariance
 
 TruthKind = Literal["gps", "mocap", "exact"]
 TRUTH_SIGMAS = {"gps": (0.2, 0.1), "mocap": (0.002, 0.2), "exact": (0.0, 0.0)}
 """Of each coordinate, metres, and about each axis, degrees: what KITTI's OXTS says of itself without RTK, and the data
 sheet of its heading; what EuRoC's authors say of Vicon and laser tracker with an IMU."""
+# Sigma of a height over that of another coordinate: at 95 % GPS is within 13 m in height and 8 m in the plane (Standard
+# Positioning Service Performance Standard, 2020), which is 6.6 m and 3.3 m a coordinate.
+_GPS_HEIGHT = 2.0
+# What KITTI's OXTS says of the velocity by which INS carries a position on, m/s.
+_GPS_DRIFT = 0.03
 KIND_WORDS = {"gps": "GPS/INS", "mocap": "motion capture or a laser tracker", "exact": "exact"}
 # No motion capture looks further, metres.
 _LARGEST_HALL = 40.0
@@ -22,6 +29,37 @@ _LARGEST_HALL = 40.0
 _CONSTANT, _CONSTANT_STEPS, _CONSTANT_TIME = 2e-3, 5, 0.4
 # A step that turns less may be constant by the file's digits, or because nothing turns: a stage, a stop.
 _LEAST_TURN = 25 * _CONSTANT
+
+
+def truth_errors(
+    path: Path, truth: Trajectory, kind: TruthKind | None, given: tuple[float | None, float | None]
+) -> tuple[TruthErrors | None, str | None]:
+    """Errors of a truth, None where it is exact; and what is said where its kind is guessed.
+
+    Heights of GPS are along the camera's y in KITTI's format, else along the world's z.
+
+    Args:
+        path, truth: of `guess_truth_kind`.
+        kind: of the truth; None: guessed.
+        given: sigmas of each coordinate, metres, and about each axis, degrees, in place of the kind's.
+    """
+    known, reason = (kind or "exact", "") if kind or None not in given else guess_truth_kind(path, truth)
+    usual = TRUTH_SIGMAS[known]
+    position, rotation = (own if said is None else said for own, said in zip(usual, given, strict=True))
+    covariance, unrelated_after = truth_covariance(position, rotation), 0.0
+    if known == "gps" and given[0] is None:
+        vertical = truth.poses[:, 1 if trajectory_format(path) == "kitti" else 2, :3]  # in the body
+        covariance = np.tile(covariance, (len(truth), 1, 1))
+        covariance[:, :3, :3] += (_GPS_HEIGHT**2 - 1.0) * position**2 * vertical[:, :, None] * vertical[:, None, :]
+        unrelated_after = math.sqrt(2.0) * position / _GPS_DRIFT
+    errors = TruthErrors(covariance, unrelated_after) if max(position, rotation) > 0.0 else None
+    if not reason:
+        return errors, None
+    words = f"sigma {position:g} m and {rotation:g} deg" if errors else "without errors"
+    return errors, (
+        f"is taken for {KIND_WORDS[known]}, {words}, as {reason}: --truth-kind, or --truth-sigma-position and "
+        "--truth-sigma-rotation, say it better"
+    )
 
 
 def guess_truth_kind(path: Path, truth: Trajectory) -> tuple[TruthKind, str]:

@@ -8,7 +8,7 @@ import pytest
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam_benchmarks.live.calibration_faults import CALIBRATION_FAULTS, injected_errors
 from sigmaslam_benchmarks.live.calibration_page import format_calibration_page
-from sigmaslam_benchmarks.live.driver_faults import DrivenFrame
+from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, DrivenFrame
 from sigmaslam_benchmarks.live.judge import DrivenPose, References, judge
 from sigmaslam_benchmarks.live.live_page import LivePage
 from sigmaslam_benchmarks.live.recordings import Recording
@@ -22,7 +22,7 @@ CAMERA = StereoCamera(EYE, EYE, np.array([[1.0, 0, 0, 0.2], [0, 1, 0, 0], [0, 0,
     ("case", "expected"),
     [
         ("none", {}),
-        ("columns_2", {"offset": 2.0}),
+        ("centre_2", {"offset": 2.0}),
         ("yaw_0.1", {"offset": -500 * np.radians(0.1), "yaw": -500 * np.radians(0.1)}),
         ("zoom_0.5", {"zoom": 2.5}),
         ("baseline_1", {"baseline": -0.01}),
@@ -35,6 +35,10 @@ def test_what_is_put_in_is_known(case: str, expected: dict[str, float]):
     assert found.keys() - expected.keys() <= {"zoom"}  # of a lens, a little
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, rel=0.12)
+
+
+def test_a_name_stands_for_one_fault_alone():
+    assert CALIBRATION_FAULTS.keys() & FAULTS.keys() == {NO_FAULT}
 
 
 def test_late_right_images_show_the_scene_as_it_has_moved_on():

@@ -10,14 +10,14 @@ import torch
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam_benchmarks.tracking.consistency import depths_around
 from sigmaslam_benchmarks.tracking.consistency_page import DRAWN, ConsistencyResult, Scale, format_noise, format_page
-from sigmaslam_evaluation.metrics.map_consistency import (
-    coverage,
+from sigmaslam_benchmarks.tracking.map_consistency import (
     depth_edges,
     mean_with_error,
     point_nees,
     points_of_depth,
     ratio_with_error,
 )
+from sigmaslam_evaluation.metrics.trajectory_errors import coverage
 from sigmaslam_synthetic.simulation import Recipe, Studio, simulate
 
 CAMERA = RectifiedStereo(fx=100.0, fy=100.0, cx=31.5, cy=23.5, baseline=0.1, width=64, height=48)

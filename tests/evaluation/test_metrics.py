@@ -20,7 +20,7 @@ from sigmaslam_evaluation.metrics.trajectory_errors import (
     relative_pose_error,
     synchronise,
 )
-from sigmaslam_evaluation.metrics.truth_covariance import truth_covariance
+from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors, truth_covariance
 
 
 @pytest.fixture(scope="module")
@@ -302,7 +302,7 @@ def test_errors_of_the_truth_are_part_of_the_nees_where_they_are_known():
         estimated = exact @ se3_exp(np.stack([np.zeros(6), rng.multivariate_normal(np.zeros(6), covariance)]))
         measured = exact @ se3_exp(rng.multivariate_normal(np.zeros(6), of_truth, 2))
         pair = Trajectory(np.arange(2.0), estimated), Trajectory(np.arange(2.0), measured), np.stack([covariance] * 2)
-        values.append([pose_nees(*pair, of_truth).mean, pose_nees(*pair).mean])
+        values.append([pose_nees(*pair, TruthErrors(of_truth)).mean, pose_nees(*pair).mean])
     with_truth, without = np.mean(values, axis=0)
     assert with_truth == pytest.approx(1.0, abs=0.1)  # four standard errors of chi-square with 6 dof are 0.12
     assert without > 2.0

@@ -24,7 +24,7 @@ from sigmaslam.run_record.relative_pose_file import (
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
 from sigmaslam_evaluation.metrics.relative_consistency import relative_consistency
-from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covariance, truth_covariance
+from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors, relative_truth_covariance, truth_covariance
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.commands import run_here
 
@@ -137,7 +137,7 @@ def test_a_noisy_truth_counts_by_its_sigmas():
     scale = np.repeat([position, math.radians(rotation_deg)], 3)
     noisy = Trajectory(exact.timestamps, exact.poses @ se3_exp(scale * rng.standard_normal((COUNT, 6))))
     pairs = pairs_of(exact, {"1 m": 1, "10 m": 10})
-    of_truth = np.tile(truth_covariance(position, rotation_deg), (COUNT, 1, 1))
+    of_truth = TruthErrors(truth_covariance(position, rotation_deg))
     for as_exact, judged in zip(
         relative_consistency(pairs, exact, noisy), relative_consistency(pairs, exact, noisy, of_truth), strict=True
     ):
@@ -158,7 +158,7 @@ def test_half_of_the_covariance_is_where_the_truth_begins_to_rule():
         relative = se3_inverse(truth.poses[pairs.earlier]) @ truth.poses[pairs.later]
         whole = relative_truth_covariance(relative, of_truth[pairs.earlier], of_truth[pairs.later])
         pairs = replace(pairs, covariance=whole / factor)
-        (span,) = relative_consistency(pairs, truth, truth, of_truth)
+        (span,) = relative_consistency(pairs, truth, truth, TruthErrors(of_truth))
         assert span.truth_share == pytest.approx(factor / (1.0 + factor), rel=1e-6)
         assert span.truth_rules == rules
 
@@ -166,7 +166,7 @@ def test_half_of_the_covariance_is_where_the_truth_begins_to_rule():
 def test_an_estimate_that_is_too_sure_does_not_make_the_truth_rule():
     """Errors of ten sigmas of the truth are the estimate's, whatever it claims."""
     truth = winding_path()
-    of_truth = np.tile(0.01 * np.diag(SIGMA**2), (COUNT, 1, 1))
+    of_truth = TruthErrors(0.01 * np.diag(SIGMA**2))
     (span,) = relative_consistency(pairs_of(truth, {"1 m": 1}, claimed=1e-4), truth, truth, of_truth)
     assert span.truth_share > 0.9
     assert span.mean_nees > 10

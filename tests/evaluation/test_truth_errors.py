@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sigmaslam.geometry.se3 import se3_adjoint, se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import rotation_exp, se3_adjoint, se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_trajectory, write_kitti, write_tum
 from sigmaslam_evaluation.metrics.relative_consistency import SpanConsistency
 from sigmaslam_evaluation.metrics.trajectory_errors import PoseNees
 from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.run_evaluation import evaluate_run
-from sigmaslam_evaluation.truth_errors import guess_truth_kind, leave_out_interpolated
+from sigmaslam_evaluation.truth_errors import guess_truth_kind, leave_out_interpolated, truth_errors
 from tests.support.commands import run_here
 
 TIMES = 0.1 * np.arange(80)
@@ -184,3 +184,24 @@ def test_a_nees_far_from_one_gets_one_sentence(
     assert verdict["kind"] == kind
     assert words in verdict["text"]
     assert verdict["text"].count(". ") == 0
+
+
+def test_heights_of_gps_are_worse_and_its_errors_change_slowly(tmp_path: Path):
+    """A camera that looks along the world's x, with y down as in KITTI: what is vertical is its y all the way."""
+    poses = np.tile(np.eye(4), (201, 1, 1))
+    poses[:, :3, :3] = rotation_exp(np.array([0.0, np.pi / 2, 0.0]))
+    truth, path = Trajectory(0.1 * np.arange(201), poses), tmp_path / "poses.txt"
+    write_kitti(path, truth)
+    errors, said = truth_errors(path, truth, "gps", (None, 0.0))
+    assert errors is not None
+    assert said is None
+    # After 1 s INS has gone off by 0.03 m at most; after ten both ends err by themselves, by 0.2 m each.
+    for frames, expected in ((10, 0.03), (200, 0.2 * np.sqrt(2.0))):
+        (found,) = errors.between(truth, np.array([0]), np.array([frames]))
+        np.testing.assert_allclose(np.sqrt(np.diag(found)), [expected, 2 * expected, expected, 0, 0, 0], atol=1e-9)
+    stated, _ = truth_errors(path, truth, "gps", (0.5, 0.1))
+    assert stated is not None
+    (found,) = stated.between(truth, np.array([0]), np.array([1]))
+    np.testing.assert_allclose(np.sqrt(np.diag(found))[:3], 0.5 * np.sqrt(2.0))
+    assert truth_errors(path, truth, "exact", (None, None)) == (None, None)
+    assert truth_errors(path, truth, None, (0.0, 0.0)) == (None, None)

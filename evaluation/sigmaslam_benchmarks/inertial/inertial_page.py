@@ -7,8 +7,8 @@ import numpy as np
 
 from sigmaslam_benchmarks.inertial.dark_runs import BOUND, METHODS, STATES, DarkResult
 from sigmaslam_benchmarks.live.recordings import Recording
+from sigmaslam_benchmarks.tracking.map_consistency import mean_with_error
 from sigmaslam_benchmarks.tracking.page import fill_page, number, number_with_error
-from sigmaslam_evaluation.metrics.map_consistency import mean_with_error
 
 # Goals of the page.
 _MH01_METRES, _MH01_MEDIAN, _MH01_ATE = 0.05, 0.03, 0.0039

@@ -57,7 +57,7 @@ def _sizes(name: str, words: str, change: Any, sizes: dict[str, Any]) -> dict[st
 
 CALIBRATION_FAULTS: dict[str, Fault] = {
     NO_FAULT: FAULTS[NO_FAULT],
-    **_sizes("columns", "cx of the right eye {} px too large", move_centre, {"1": 1.0, "2": 2.0, "4": 4.0}),
+    **_sizes("centre", "cx of the right eye {} px too large", move_centre, {"1": 1.0, "2": 2.0, "4": 4.0}),
     **_sizes(
         "yaw",
         "right eye turned by {}° about the vertical",

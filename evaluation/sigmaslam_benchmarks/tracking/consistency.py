@@ -18,10 +18,11 @@ from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam_benchmarks.code_hash import hash_once
 from sigmaslam_benchmarks.rendered_camera import draw_calibration, open_rendered, read_simulation
+from sigmaslam_benchmarks.tracking import map_consistency as consistency
 from sigmaslam_benchmarks.tracking.consistency_page import DRAWN, ConsistencyResult, Scale, format_noise, format_page
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Trial, track_ours
-from sigmaslam_evaluation.metrics import map_consistency as consistency
+from sigmaslam_evaluation.metrics.trajectory_errors import coverage
 from sigmaslam_evaluation.truth_conventions import find_truth
 from sigmaslam_synthetic.simulation import Recipe, Studio
 
@@ -140,14 +141,14 @@ def _track(source: Path, recipe: Recipe, method: str) -> ConsistencyResult:
     nan = float("nan")
     return ConsistencyResult(
         nees=evaluation.nees.mean,
-        inside=consistency.coverage(evaluation.nees.per_frame, 6),
+        inside=coverage(evaluation.nees.per_frame, 6),
         nis=float(columns["nis"][tracked].sum() / dof) if dof else nan,
         ate=evaluation.ate.rmse,
         path_length=evaluation.path_length,
         offset_error=float(columns["disparity_offset"][-1] - OFFSET),
         lost=int((~tracked[1:]).sum()),
         point_nees=float(nees.mean()) if some else nan,
-        point_inside=consistency.coverage(nees, 3),
+        point_inside=coverage(nees, 3),
         point_gross=float((3.0 * nees > _GROSS**2).mean()) if some else nan,
         relative={span.span: (span.mean_nees, span.inside) for span in evaluation.relative or ()},
     )

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from sigmaslam.slam.relative_poses import SPANS
+from sigmaslam_benchmarks.tracking.map_consistency import mean_with_error, ratio_with_error
 from sigmaslam_benchmarks.tracking.page import fill_page, number_with_error
-from sigmaslam_evaluation.metrics.map_consistency import mean_with_error, ratio_with_error
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from sigmaslam_benchmarks.tracking.shake_page import GROSS, ShakenSequence, Shak
 from sigmaslam_benchmarks.tracking.stereo_peers import track_with_peer
 from sigmaslam_benchmarks.tracking.trial_pool import SequenceTrials, TrialKind, write_trials
 from sigmaslam_benchmarks.trial import Method, Trial, track_ours
-from sigmaslam_evaluation.metrics.map_consistency import coverage
+from sigmaslam_evaluation.metrics.trajectory_errors import coverage
 from sigmaslam_evaluation.truth_conventions import find_truth
 from sigmaslam_synthetic.presets import PRESETS
 from sigmaslam_synthetic.render_choices import CARRIED

@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 
 from sigmaslam_benchmarks.tracking.image_motion import ImageMotion
+from sigmaslam_benchmarks.tracking.map_consistency import mean_with_error
 from sigmaslam_benchmarks.tracking.page import fill_page, number_with_error
-from sigmaslam_evaluation.metrics.map_consistency import mean_with_error
 
 GROSS = 5.0
 """Sigmas beyond which a frame is wrong."""

@@ -10,9 +10,8 @@ from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.run_record.relative_pose_file import FramePairs
 from sigmaslam.slam.relative_poses import SPANS
-from sigmaslam_evaluation.metrics.map_consistency import coverage
-from sigmaslam_evaluation.metrics.trajectory_errors import associate, is_regular
-from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covariance
+from sigmaslam_evaluation.metrics.trajectory_errors import associate, coverage, is_regular
+from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ class SpanConsistency:
 
 
 def relative_consistency(
-    pairs: FramePairs, estimate: Trajectory, truth: Trajectory, truth_covariances: np.ndarray | None = None
+    pairs: FramePairs, estimate: Trajectory, truth: Trajectory, truth_errors: TruthErrors | None = None
 ) -> tuple[SpanConsistency, ...]:
     """Consistency of relative poses for each span that has pairs with truth and regular covariances.
 
@@ -76,7 +75,7 @@ def relative_consistency(
         pairs: of the estimate.
         estimate: N poses, whose time stamps count.
         truth: any number of poses.
-        truth_covariances: (K, 6, 6) of the true poses in their body frames; None: they count as exact.
+        truth_errors: of the true poses; None: they count as exact.
     Raises:
         InputError: no timestamps agree.
     """
@@ -88,8 +87,8 @@ def relative_consistency(
     pairs, earlier, later = pairs.select(known), earlier[known], later[known]
     true = se3_inverse(truth.poses[earlier]) @ truth.poses[later]
     covariances, of_truth = pairs.covariance, np.zeros_like(pairs.covariance)
-    if truth_covariances is not None:
-        of_truth = relative_truth_covariance(true, truth_covariances[earlier], truth_covariances[later])
+    if truth_errors is not None:
+        of_truth = truth_errors.between(truth, earlier, later)
         covariances = covariances + of_truth
     regular = is_regular(covariances)
     errors = se3_log(se3_inverse(pairs.pose) @ true)
@@ -97,7 +96,7 @@ def relative_consistency(
     for span in SPANS:
         rows = regular & (pairs.span == span)
         if rows.any():
-            parts = of_truth[rows] if truth_covariances is not None else None
+            parts = of_truth[rows] if truth_errors is not None else None
             found.append(_judge(span, errors[rows], covariances[rows], parts))
     return tuple(found)
 

@@ -8,11 +8,12 @@ from typing import Literal
 import numpy as np
 
 from sigmaslam.errors import InputError
+from sigmaslam.estimation.chi_square import CHI_SQUARE_95
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.two_view.absolute_orientation import absolute_orientation
-from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covariance
+from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors
 
 Alignment = Literal["se3", "origin"]
 # Seconds that the timestamps of an estimated and a true pose may differ.
@@ -321,7 +322,7 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
 
 
 def pose_nees(
-    estimate: Trajectory, truth: Trajectory, covariance: np.ndarray, of_truth: np.ndarray | None = None
+    estimate: Trajectory, truth: Trajectory, covariance: np.ndarray, of_truth: TruthErrors | None = None
 ) -> PoseNees:
     """NEES of poses relative to the first, per degree of freedom.
 
@@ -331,7 +332,7 @@ def pose_nees(
     Args:
         estimate: N poses; truth: any.
         covariance: (N, 6, 6) of the pose in its body frame, (translation, rotation), metres and radians.
-        of_truth: (6, 6) of each true pose in its body frame, independent of the others; None: they count as exact.
+        of_truth: of the true poses; None: they count as exact.
     Raises:
         ValueError: the covariance is not (N, 6, 6).
         InputError: no timestamps agree.
@@ -343,9 +344,8 @@ def pose_nees(
     used[0] = False
     errors, P = result.errors[used], covariance[result.index[used]]
     if of_truth is not None:
-        true = truth.poses[associate(estimate, truth)[1]]
-        since_first = se3_inverse(true[:1]) @ true[used]
-        P = P + relative_truth_covariance(since_first, of_truth, of_truth)
+        later = associate(estimate, truth)[1]
+        P = P + of_truth.between(truth, np.full_like(later, later[0])[used], later[used])
     full = squared_mahalanobis(errors, P) / 6
     translation = squared_mahalanobis(errors[:, :3], P[:, :3, :3]) / 3
     rotation = squared_mahalanobis(errors[:, 3:], P[:, 3:, 3:]) / 3
@@ -359,6 +359,16 @@ def pose_nees(
         per_frame=full,
         with_truth=of_truth is not None,
     )
+
+
+def coverage(nees: np.ndarray, dof: int) -> float:
+    """Share of errors inside the ellipsoid that holds 95 % of a Gaussian's; NaN without errors.
+
+    Args:
+        nees: (N,) normalised errors squared, per degree of freedom.
+        dof: of each, 1 to 6.
+    """
+    return float((nees * dof <= CHI_SQUARE_95[dof]).mean()) if len(nees) else float("nan")
 
 
 def is_regular(covariance: np.ndarray) -> np.ndarray:

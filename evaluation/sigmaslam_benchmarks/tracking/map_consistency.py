@@ -1,25 +1,14 @@
-"""Whether covariances are what they say: coverage, errors of map points in sigmas, means with their own errors."""
+"""Errors of map points in sigmas, and means with their own errors."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_95
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.camera import RectifiedStereo
 
 EDGE = 0.02
 """Where inverse depth bends by more than this share of itself within a pixel, a point's true depth is in doubt."""
-
-
-def coverage(nees: np.ndarray, dof: int) -> float:
-    """Share of errors inside the ellipsoid that holds 95 % of a Gaussian's; NaN without errors.
-
-    Args:
-        nees: (N,) normalised errors squared, per degree of freedom.
-        dof: of each, 1 to 6.
-    """
-    return float((nees * dof <= CHI_SQUARE_95[dof]).mean()) if len(nees) else float("nan")
 
 
 def mean_with_error(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
