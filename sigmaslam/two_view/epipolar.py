@@ -1,5 +1,7 @@
 """Relative orientation of two calibrated views from matches: the 5-point method, then least squares by covariance."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import cv2
@@ -120,6 +122,10 @@ class MatchedRays:
         variance = a * a * uu1 + 2.0 * a * b * uv1 + b * b * vv1 + c * c * uu0 + 2.0 * c * d * uv0 + d * d * vv0
         sigma = np.sqrt(np.maximum(variance, 1e-24))
         return (self.rays1 * by1).sum(axis=1) / sigma, sigma
+
+    def chosen(self, rows: np.ndarray) -> MatchedRays:
+        """Some of the matches."""
+        return MatchedRays(self.rays0[rows], self.rays1[rows], self.spread0, self.spread1[rows])
 
     def in_front(self, R: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """(M,) bool, whether the rays meet in front of both cameras, or are parallel within their errors."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -48,6 +48,9 @@ _PRIOR = np.diag([0.0, 0.0, 0.0, 1.0 / _UNKNOWN_DIRECTION, 1.0 / _UNKNOWN_DIRECT
 # If the inliers depart from a turn by no more than this, relative to their variance across the lines, nothing is known
 # of the direction: without a translation it is 1 to 1.3, as the lines are those that suit the errors best.
 _NO_PARALLAX = 2.0
+# All but a few of the inliers are within three standard deviations of where a plane puts them, and their variance is
+# no more than so many times that across the lines, if they are on one.
+_FLAT_SHARE, _FLAT = 0.95, 1.3
 # Squared distance, in standard deviations per pose, below which two poses are one.
 _SAME = 0.02
 
@@ -108,7 +111,7 @@ def estimate_relative_orientation(
     if hopeful.sum() < MIN_MATCHES:
         return None
     probable, pixels0, weight = probable[hopeful], pixels0[hopeful], weight[hopeful]
-    rays = MatchedRays(rays0[hopeful], rays1[hopeful], rays.spread0, rays.spread1[hopeful])
+    rays = rays.chosen(hopeful)
     fits = [_Fit.of(rays, weight, *pose) for pose in first]
     rng = np.random.default_rng(0)
     for _ in range(_STARTS):
@@ -116,6 +119,9 @@ def estimate_relative_orientation(
         step = _WIDTH * np.linalg.cholesky(best.covariance) @ rng.standard_normal(5)
         fits.append(_Fit.of(rays, weight, *_refine(rays, weight, *_moved(best.R, best.direction, step))))
     best = min(fits, key=lambda fit: fit.cost)
+    if _on_plane(rays, weight, best) is not None:
+        fits = [_on_plane(rays, weight, fit) or fit for fit in fits]
+        best = min(fits, key=lambda fit: fit.cost)
     at = _at(rays, best.R, best.direction)
     scores = np.where(best.inliers[:, None], at.J * at.residual[:, None], 0.0)
     clusters = neighbours_factor(pixels0, scores, np.linalg.inv(best.covariance))
@@ -277,28 +283,63 @@ class _Fit:
         return cls(R, direction, cost, inliers, scale, np.linalg.inv(information))
 
 
-def _turn_alone(rays: MatchedRays, best: _Fit) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rotation and its covariance (3, 3) if the inliers follow a mere turn within their errors, else None.
+def _fit_places(
+    rays: MatchedRays, R: np.ndarray, direction: np.ndarray, free: slice
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pose of points on the plane normal . X = distance (over the baseline's length) by both coordinates in image 1.
 
-    The turn that takes the rays nearest to each other (Kabsch 1976) is as good as the best one where errors are alike.
+    Of rotation, angles of the direction and normal those that are free move; the normal starts at 0, a mere turn.
+
+    Returns:
+        Rotation, direction, squared errors (M,) in standard deviations, information of what is free.
     """
-    rays0, rays1 = rays.rays0[best.inliers], rays.rays1[best.inliers]
-    u, _, vt = np.linalg.svd((rays1 / (rays1**2).sum(axis=1, keepdims=True)).T @ rays0)
-    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    x, y, z = rays0 @ R.T[:, :1], rays0 @ R.T[:, 1:2], rays0 @ R.T[:, 2:]
-    x, y = x / z, y / z
-    error = rays1[:, :2] - np.c_[x, y]
-    weight = np.linalg.inv(rays.spread1[best.inliers] + rays.spread0)
-    variance = float(np.einsum("mi,mij,mj->", error, weight, error)) / (2 * len(error))
-    across = float((_at(rays, best.R, best.direction).residual[best.inliers] ** 2).mean())
-    if variance > _NO_PARALLAX * across:
+    normal, inverse = np.zeros(3), np.linalg.inv(rays.spread1 + rays.spread0)
+    for turn in range(_WIDE_STEPS + _STEPS):
+        turned, tangent = rays.rays0 @ R.T, np.linalg.svd(direction[None])[2][1:]
+        along = (rays.rays0 @ normal)[:, None]
+        seen = turned + along * direction
+        slopes = [np.cross(axis, turned) for axis in np.eye(3)] + [along * way for way in tangent]
+        slopes += [rays.rays0[:, k : k + 1] * direction for k in range(3)]
+        by_seen, depth = np.stack(slopes, axis=2), seen[:, 2, None, None]
+        J = (by_seen[:, :2] - seen[:, :2, None] / depth * by_seen[:, 2:]) / depth
+        error = rays.rays1[:, :2] - seen[:, :2] / seen[:, 2:]
+        squared = np.einsum("mi,mij,mj->m", error, inverse, error)
+        wide = turn < _WIDE_STEPS
+        loss = robust_weight(np.sqrt(squared) / _WIDER) if wide else soft_weight(squared)
+        # The plane is found before the pose moves, at first by least squares.
+        moves = np.r_[5:8] if wide and free.stop > 5 else np.r_[free]
+        weighted = J[..., moves].transpose(0, 2, 1) @ inverse * (loss if turn else np.ones_like(loss))[:, None, None]
+        information = (weighted @ J[..., moves]).sum(axis=0)
+        step = np.zeros(8)
+        step[moves] = np.linalg.lstsq(information, (weighted @ error[..., None]).sum(axis=0)[:, 0], rcond=1e-12)[0]
+        (R, direction), normal = _moved(R, direction, step[:5]), normal + step[5:]
+        if not wide and np.abs(step[:5]).max() < _CONVERGED:
+            break
+    return R, direction, squared, information
+
+
+def _turn_alone(rays: MatchedRays, best: _Fit) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rotation and its covariance (3, 3) if the inliers follow a mere turn within their errors, else None."""
+    near = rays.chosen(best.inliers)
+    R, _, squared, information = _fit_places(near, best.R, best.direction, slice(0, 3))
+    variance = float(squared.mean()) / 2.0
+    if variance > _NO_PARALLAX * float((_at(near, best.R, best.direction).residual ** 2).mean()):
         return None
-    one = np.ones_like(x)
-    J = np.stack([np.c_[-x * y, one + x * x, -y], np.c_[-one - y * y, x * y, x]], axis=1)
-    covariance = np.linalg.inv((J.transpose(0, 2, 1) @ weight @ J).sum(axis=0))
     # A translation that the errors hide looks like a turn by as much as they are.
-    hidden = float(np.trace(np.linalg.inv(weight), axis1=1, axis2=2).mean()) / 2.0
-    return R, max(1.0, variance) * (covariance + hidden * np.eye(3))
+    hidden = float(np.trace(near.spread1 + near.spread0, axis1=1, axis2=2).mean()) / 2.0
+    return R, max(1.0, variance) * (np.linalg.inv(information) + hidden * np.eye(3))
+
+
+def _on_plane(rays: MatchedRays, probability: np.ndarray, fit: _Fit) -> _Fit | None:
+    """The fit by both coordinates of the inliers if they are on one plane within their errors, else None."""
+    R, direction, squared, known = _fit_places(rays.chosen(fit.inliers), fit.R, fit.direction, slice(0, 8))
+    flat = squared < _GATE**2
+    scale = float(squared[flat].sum()) / max(2 * int(flat.sum()) - 8, 1)
+    if flat.mean() < _FLAT_SHARE or scale > _FLAT * fit.scale:
+        return None
+    known = known[:5, :5] - known[:5, 5:] @ np.linalg.pinv(known[5:, 5:]) @ known[5:, :5]
+    covariance = np.linalg.inv(known / max(1.0, scale) + _PRIOR)
+    return replace(_Fit.of(rays, probability, R, direction), covariance=covariance)
 
 
 def _mixture(fits: list[_Fit], best: _Fit, clusters: float) -> tuple[np.ndarray, float, tuple[float, float]]:

@@ -23,6 +23,13 @@ def test_right_matches_lie_on_the_lines_of_the_pose_and_wrong_ones_anywhere(name
     assert near.mean() == pytest.approx(1.0 - CASES[name].wrong, abs=0.12)
 
 
+def test_a_method_is_ahead_only_where_chance_does_not_make_it_so():
+    ours = np.random.default_rng(0).gamma(4.0, 1.0, (40, 2))
+    others = {"ours": list(ours), "alike": list(ours[::-1] * (0.99, 1.3)), "better": list(ours * (1.2, 0.4))}
+    assert orientation_peers._ahead(others) == "better's direction"
+    assert orientation_peers._ahead({"ours": list(ours), "worse": list(2.0 * ours)}) == "none"
+
+
 @pytest.mark.slow
 def test_the_table_has_a_row_a_case_and_says_what_is_not_installed(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(orientation_peers, "SEEDS", range(2))
@@ -33,7 +40,7 @@ def test_the_table_has_a_row_a_case_and_says_what_is_not_installed(monkeypatch: 
     found = hard_cases(None, told.append)
     plane, forward = found["hard_rows"]
     assert (plane[0], forward[0]) == names
-    assert len(plane) == len(forward) == 5
+    assert len(plane) == len(forward) == 6
     # Each case has its own matches.
     assert plane[1:] != forward[1:]
     assert found["not_installed"] == ["poselib", "pycolmap"]

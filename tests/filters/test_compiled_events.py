@@ -168,6 +168,43 @@ def test_the_vehicle_of_the_examples(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["compass.hpp", "gps.hpp", "wheel.hpp"]
 
 
+class Directions:
+    """Unit vectors; a tangent is what is added before the length is made one again, in the plane of two rows."""
+
+    point_size, tangent_size = 3, 2
+
+    def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        moved = point + (tangent.unsqueeze(-2) @ self._rows(point)).squeeze(-2)
+        return torch.nn.functional.normalize(moved, dim=-1)
+
+    def local(self, point: Tensor, other: Tensor) -> Tensor:
+        ahead = (point * other).sum(dim=-1, keepdim=True)
+        return (self._rows(point) @ other.unsqueeze(-1)).squeeze(-1) / ahead
+
+    def _rows(self, point: Tensor) -> Tensor:
+        x, y, z = point.unbind(-1)
+        flat, share = torch.zeros_like(x), 1.0 / (1.0 + z)
+        return torch.stack(
+            [torch.stack([1.0 - x * x * share, -x * y * share, flat - x], -1),
+             torch.stack([-x * y * share, 1.0 - y * y * share, flat - y], -1)], -2
+        )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 40], ids=["one by one", "as a batch"])
+def test_an_extended_filter_on_a_manifold_of_ones_own_is_compiled(count: int, caplog: pytest.LogCaptureFixture):
+    space = Directions()
+    motion = filters.MotionModel(lambda at, step: space.retract(at, step), filters.Diagonal(tensor(1e-4, 1e-4)))
+    see = filters.MeasurementModel(lambda at: at[..., :2], filters.Diagonal(tensor(0.01, 0.01)))
+    ekf, start = filters.ExtendedKalmanFilter(space), tensor(0.0, 0.0, 1.0).expand(count, 3)
+    prior = filters.Gaussian(start, (0.1 * EYE).expand(count, 2, 2))
+    values, steps = 0.2 * random_numbers(6, count, 2, seed=1), 0.1 * random_numbers(5, count, 2, seed=2)
+    with caplog.at_level(logging.INFO):
+        found = filters.compile_filter(ekf, motion, see)(prior, values, [steps])
+    assert_same_track(found, ekf.filter(prior, motion, see, values, [steps]))
+    assert "no arithmetic" not in caplog.text
+
+
 @pytest.mark.slow
 def test_noise_is_learned_by_gradients_through_the_compiled_filter():
     example = load_example("learn_noise")

@@ -169,6 +169,9 @@ class _Interpreter(fx.Interpreter):
             return self._product(*args)
         if name in _REDUCED:
             return self._reduced(name, *args)
+        if name == "linalg_vector_norm" and args[1:2] in ((), (2,)):
+            total = self._reduced("sum", self._each("mul", args[0], args[0]), *args[2:])
+            return self._each("sqrt", total)
         if name == "linalg_inv_ex":
             return self._inverse(args[0]), None
         result = self._arithmetic(name, args, kwargs) if torch.Tag.pointwise in target.tags else None

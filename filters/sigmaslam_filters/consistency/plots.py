@@ -42,8 +42,15 @@ def plot_nees(
     at = np.arange(len(mean)) if seconds is None else _to_numpy(seconds)
     if at.shape != mean.shape:
         raise ValueError(f"seconds must be ({len(mean)},), one a step, not {at.shape}")
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    axes = figure.add_subplot()
+    if title is None:
+        ratio_low, ratio_high = check.normalised_interval
+        title = f"{quantity} per degree of freedom {check.normalised_mean:.3g}"
+        if np.isfinite(ratio_low):
+            title += f" ({ratio_low:.3g} to {ratio_high:.3g})"
+        title += f"; {_percent(check.share_inside)} of the steps inside"
+        if check.nan_count:
+            title += f"; {check.nan_count} NaN left out"
+    figure, axes = _figure((8, 3.2), "step" if seconds is None else "time [s]", quantity, title)
     band = f"{_percent(check.probability)} band, {check.runs} run{'s' if check.runs > 1 else ''}"
     # Each step has a width, so that one between two without a value is seen as well.
     edges = _edges(at)
@@ -56,22 +63,10 @@ def plot_nees(
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
-    if title is None:
-        ratio_low, ratio_high = check.normalised_interval
-        title = f"{quantity} per degree of freedom {check.normalised_mean:.3g}"
-        if np.isfinite(ratio_low):
-            title += f" ({ratio_low:.3g} to {ratio_high:.3g})"
-        title += f"; {_percent(check.share_inside)} of the steps inside"
-        if check.nan_count:
-            title += f"; {check.nan_count} NaN left out"
-    axes.set_title(title, fontsize=10)
-    axes.set_xlabel("step" if seconds is None else "time [s]")
-    axes.set_ylabel(quantity)
     if seconds is None:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.margins(x=0.01)
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    _style_axes(axes)
     return figure
 
 
@@ -84,24 +79,19 @@ def plot_whiteness(whiteness: Whiteness, title: str | None = None) -> Figure:
     """
     correlation, band = _to_numpy(whiteness.autocorrelation), _to_numpy(whiteness.band)
     lags = np.arange(1, len(correlation) + 1)
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    axes = figure.add_subplot()
+    if title is None:
+        p_value = f"{whiteness.p_value:.2g}" if not whiteness.p_value < 1e-4 else "< 0.0001"
+        title = f"White noise: p {p_value}; {_percent(whiteness.share_inside)} of the lags inside"
+    figure, axes = _figure((8, 3.2), "lag [steps]", "autocorrelation", title)
     edges, reach = _edges(lags), np.repeat(band, 2)
     label = f"{_percent(whiteness.probability)} band"
     axes.fill_between(edges, -reach, reach, color=GREEN, alpha=0.25, lw=0, label=label)
     axes.axhline(0.0, color=GREY, lw=1)
     axes.vlines(lags, 0.0, correlation, color=BLUE, lw=1.2)
     axes.plot(lags, correlation, color=BLUE, marker="o", ms=4, ls="", label="innovations")
-    if title is None:
-        p_value = f"{whiteness.p_value:.2g}" if not whiteness.p_value < 1e-4 else "< 0.0001"
-        title = f"White noise: p {p_value}; {_percent(whiteness.share_inside)} of the lags inside"
-    axes.set_title(title, fontsize=10)
-    axes.set_xlabel("lag [steps]")
-    axes.set_ylabel("autocorrelation")
     axes.set_xlim(0.5, len(lags) + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    _style_axes(axes)
     return figure
 
 
@@ -121,36 +111,24 @@ def plot_coverage(coverage: Coverage, labels: Sequence[str] | None = None, title
         labels = ["errors"] if len(share) == 1 else [f"axis {axis}" for axis in range(len(share))]
     if len(labels) != len(share):
         raise ValueError(f"labels must be {len(share)}, one a row of shares, not {len(labels)}")
-    figure = Figure(figsize=(5.5, 5), layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes = _figure((5.5, 5), "nominal", "share of errors inside", title)
     axes.plot([0, 1], [0, 1], color=GREY, lw=1, label="consistent (below: overconfident)")
     for row, label in enumerate(labels):
-        reach = np.stack([share[row] - low[row], high[row] - share[row]]).clip(min=0)
-        axes.errorbar(
-            level,
-            share[row],
-            yerr=reach,
-            color=SERIES[row % len(SERIES)],
-            marker="o",
-            ms=4,
-            lw=1.2,
-            capsize=3,
-            label=label,
-        )
+        reach, colour = np.stack([share[row] - low[row], high[row] - share[row]]).clip(min=0), SERIES[row % len(SERIES)]
+        axes.errorbar(level, share[row], reach, color=colour, marker="o", ms=4, lw=1.2, capsize=3, label=label)
     axes.legend(fontsize=8, loc="upper left", frameon=False)
-    axes.set_xlabel("nominal")
-    axes.set_ylabel("share of errors inside")
-    if title is not None:
-        axes.set_title(title, fontsize=10)
-    _style_axes(axes)
     return figure
 
 
-def _style_axes(axes: Axes) -> None:
-    """Draw a light grid, and no frame at the top and right."""
+def _figure(size: tuple[float, float], across: str, up: str, title: str | None) -> tuple[Figure, Axes]:
+    """With names of the axes, a light grid, and no frame at the top and right."""
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.add_subplot(xlabel=across, ylabel=up)
+    axes.set_title(title or "", fontsize=10)
     axes.grid(True, color="#D9D9D9", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
 
 
 def _percent(share: float) -> str:

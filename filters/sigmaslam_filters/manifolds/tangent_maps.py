@@ -59,7 +59,7 @@ class Differentiated:
 
     def push_local(self, point: Tensor, change: Tensor) -> Tensor:
         """See `TangentMaps`."""
-        return push_forward(lambda y: self.space.local(point, y), [point.expand_as(change)], [change])[1]
+        return push_forward(lambda y: self.space.local(point, y), [point + torch.zeros_like(change)], [change])[1]
 
     def transport(self, point: Tensor, tangent: Tensor, change: Tensor) -> Tensor:
         """See `TangentMaps`."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.geometry.se3 import rotation_log
+from sigmaslam.two_view import relative_orientation
 from sigmaslam.two_view.relative_orientation import RelativeOrientation, estimate_relative_orientation
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]])
@@ -112,6 +113,18 @@ def test_the_other_pose_of_a_plane_is_told_and_allowed_for():
     assert found.rival > 0.05
     assert found.rival_angles[1] > np.radians(5.0)
     assert nees(scene) < 3.0
+
+
+@pytest.mark.long
+def test_points_on_a_plane_count_in_both_coordinates_and_others_do_not(monkeypatch: pytest.MonkeyPatch):
+    scenes = views(2, SIDEWAYS, 0.3, plane=True), views(2, SIDEWAYS, 0.3)
+    found = [scene.estimate() for scene in scenes]
+    plane_nees = nees(scenes[0])
+    monkeypatch.setattr(relative_orientation, "_on_plane", lambda *given: None)
+    plane, depth = (scene.estimate() for scene in scenes)
+    assert np.trace(found[0].covariance) < 0.5 * np.trace(plane.covariance)
+    assert plane_nees < 3.0
+    np.testing.assert_array_equal(found[1].covariance, depth.covariance)
 
 
 @pytest.mark.long
