@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.reconstruction.disparity import DisparityMap, pixel_grid, shrink
+from sigmaslam.reconstruction.disparity import DisparityMap, pixel_grid, shrink, window_mean
 from sigmaslam.table import Table
 
 GATE = 6.635
@@ -29,9 +29,9 @@ _SLOPE_RADIUS = 3
 _MIN_DEPTH = 1e-2
 # The variances themselves count as so many measurements of their scale.
 _FREEDOM = np.float32(4.0)
-# Windows in which images are compared: side, variance of what resampling moves them by, pixels squared, and of the
-# rounding of two grey values.
-_WINDOW, _RESAMPLING, _ROUNDING = np.full(7, 1.0 / 7.0, np.float32), np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
+# Where images are compared: variance of what resampling moves them by, pixels squared, and of the rounding of two grey
+# values.
+_RESAMPLING, _ROUNDING = np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
 # One of so many pixels is enough for a median.
 _MEDIAN_STRIDE = 8
 # Variance of each component of dense optical flow, pixels squared, of images so many times smaller, and 99 % of
@@ -46,7 +46,6 @@ _PART = 16384
 _BY_STEP = np.zeros((3, 4, 6))
 _BY_STEP[range(3), 0, range(3)] = 1.0
 _BY_STEP[(0, 1, 1, 0, 2, 2), (1, 1, 2, 3, 3, 2), (4, 3, 5, 5, 3, 4)] = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
-_PRODUCTS = np.triu_indices(4)
 # Confirmations that a point needs where there are so many other views.
 _MIN_SUPPORT = 2
 
@@ -147,7 +146,9 @@ def fuse_depth(
     cost = np.zeros_like(mean)
     texture = _texture(image.astype(np.float32)).reshape(2, -1)[:, known]
     for view, pose, covariance in others:
-        seen = _measure(view, pose, covariance, rays, mean, variance, camera)
+        parts = [slice(first, first + _PART) for first in range(0, max(len(known), 1), _PART)]
+        measured = (_measure(view, pose, covariance, rays[:, at], mean[at], variance[at], camera) for at in parts)
+        seen = _Seen.concatenate([replace(of, rows=of.rows + at.start) for of, at in zip(measured, parts, strict=True)])
         rows = seen.rows
         noise = np.float32(1.0 - shared) * seen.noise + seen.pose
         # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
@@ -234,27 +235,6 @@ def _measure(
     variance: np.ndarray,
     camera: RectifiedStereo,
 ) -> _Seen:
-    factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)]
-    # Of two different terms there are both products.
-    factors = (np.triu(factors) + np.tril(factors, -1).transpose(0, 2, 1))[:, *_PRODUCTS].astype(np.float32)
-    parts = []
-    for first in range(0, max(len(state), 1), _PART):
-        part = slice(first, first + _PART)
-        found = _measure_part(view, pose, factors, rays[:, part], state[part], variance[part], camera)
-        parts.append(replace(found, rows=found.rows + first))
-    return _Seen.concatenate(parts)
-
-
-def _measure_part(
-    view: DepthView,
-    pose: np.ndarray,
-    factors: np.ndarray,
-    rays: np.ndarray,
-    state: np.ndarray,
-    variance: np.ndarray,
-    camera: RectifiedStereo,
-) -> _Seen:
-    """What `_measure` finds of some of the pixels; `factors` as of `_pose_variances`."""
     focal_baseline = np.float32(camera.focal_baseline)
     R, t = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
     turned = R @ rays
@@ -274,6 +254,7 @@ def _measure_part(
     moves_u = np.float32(camera.fx) * (shift[0] - a * shift[2]) * inverse
     moves_v = np.float32(camera.fy) * (shift[1] - b * shift[2]) * inverse
     derivative = ahead * inverse**2 - slope_u * moves_u - slope_v * moves_v
+    factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)].astype(np.float32)
     by_pose, place_u, place_v = _pose_variances(factors, a, b, predicted, slope_u, slope_v, camera)
     place_u, place_v = moves_u**2 * variance + place_u, moves_v**2 * variance + place_v
     return _Seen(grey, rows, disparity - predicted, derivative, noise, by_pose, place_u, place_v)
@@ -291,14 +272,14 @@ def _pose_variances(
     """Variances (M,) of an innovation and of the place u and v by the step, pixels squared.
 
     Args:
-        factors: (6, 10) of the products of q, 1, a and b in the covariance of what `_BY_STEP` moves, xx to zz.
+        factors: (6, 4, 4) of the products of q, 1, a and b in the covariance of what `_BY_STEP` moves, xx to zz.
         a, b: (M,) normalised coordinates of the place.
         disparity: (M,) predicted there.
         slope_u, slope_v: (M,) of the disparities seen there.
         camera: the rectified pair.
     """
-    terms = disparity / np.float32(camera.focal_baseline), np.ones_like(a), a, b
-    xx, xy, xz, yy, yz, zz = factors @ np.stack([terms[i] * terms[j] for i, j in zip(*_PRODUCTS, strict=True)])
+    terms = np.stack([disparity / np.float32(camera.focal_baseline), np.ones_like(a), a, b])
+    xx, xy, xz, yy, yz, zz = factors.reshape(6, 16) @ (terms[:, None] * terms).reshape(16, -1)
     # The depth moves the place, too, and the slopes there the disparity: it changes by e x + f y + g z.
     e, f = np.float32(camera.fx) * slope_u, np.float32(camera.fy) * slope_v
     g = disparity - e * a - f * b
@@ -325,7 +306,7 @@ def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.
     weight, difference = np.zeros((2, *image.shape), np.float32)
     weight.ravel()[pixels] = 1.0
     difference.ravel()[pixels] = image.ravel()[pixels] - grey
-    share, mean, square = (_mean(each).ravel()[measured] for each in (weight, difference, difference**2))
+    share, mean, square = (window_mean(each).ravel()[measured] for each in (weight, difference, difference**2))
     share = np.maximum(share, np.float32(1e-3))
     place_u, place_v = seen.place_u + _RESAMPLING, seen.place_v + _RESAMPLING
     expected = _ROUNDING + texture[0][seen.rows] * place_u + texture[1][seen.rows] * place_v
@@ -346,12 +327,7 @@ def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.
 def _texture(image: np.ndarray) -> np.ndarray:
     """Mean squared derivatives by u and v in the window of each pixel, (2, H, W), grey values^2 / pixel^2."""
     step = np.array([[-0.5, 0.0, 0.5]], np.float32)
-    return np.stack([_mean(cv2.filter2D(image, -1, kernel) ** 2) for kernel in (step, step.T)])
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Means over the window of each pixel."""
-    return np.asarray(cv2.sepFilter2D(values, -1, _WINDOW, _WINDOW))
+    return np.stack([window_mean(cv2.filter2D(image, -1, kernel) ** 2) for kernel in (step, step.T)])
 
 
 def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:

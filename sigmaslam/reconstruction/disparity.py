@@ -226,11 +226,11 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     # What is saturated shows no texture, and its edges are not where the surface's are.
     seen = cv2.remap(right, u - smooth, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     weight = (known & (left < _SATURATED) & (seen < _SATURATED)).astype(np.float32)
-    share = _mean(weight)
+    share = window_mean(weight)
     inverse = np.float32(1.0) / np.maximum(share, np.float32(1e-3))
 
     def mean(weighted: np.ndarray) -> np.ndarray:
-        return _mean(weighted) * inverse
+        return window_mean(weighted) * inverse
 
     pixels = (2 * _RADIUS + 1) ** 2 * np.maximum(share, np.float32(1e-3))
     counted = reference * weight
@@ -258,7 +258,7 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     # What the last step began with, about the smooth surface.
     relief = np.where(known, np.minimum(np.abs(departs - smooth), _SAME_SURFACE), np.float32(0.0)) ** 2
     bound = np.minimum(noise / texture, _WIDEST_BOUND)
-    inverse = np.float32(1.0) / np.maximum(_mean(known.astype(np.float32)), np.float32(1e-3))
+    inverse = np.float32(1.0) / np.maximum(window_mean(known.astype(np.float32)), np.float32(1e-3))
     aligned = np.where(known, found, np.float32(0.0))
     edge = np.minimum(np.abs(aligned - mean(aligned)), _WIDEST_EDGE) ** 2
     return Alignment(
@@ -319,6 +319,6 @@ def pixel_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
+def window_mean(values: np.ndarray) -> np.ndarray:
     """Means over the window of each pixel."""
     return np.asarray(cv2.sepFilter2D(values, -1, _WINDOW, _WINDOW))
