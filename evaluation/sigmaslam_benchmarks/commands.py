@@ -192,6 +192,7 @@ BENCHMARKS = {
             _count("seeds", 20, "Sequences a world."),
             _RAY,
             _option("real", "--real", bool, "Disparities beside LiDAR and Middlebury instead.", False),
+            _option("organ", "--organ", bool, "Rigid organs alone, in millimetres.", False),
             _DATA_IF_ANY,
         ),
         _TRAIN,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +14,11 @@ from sigmaslam.cli.extras import need_viewer_extra
 from sigmaslam.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from sigmaslam.geometry.camera import StereoCamera
     from sigmaslam.live.frame_sink import FrameSink
+    from sigmaslam.live.rerun_viewer import RerunSink
     from sigmaslam.runs.request import LiveOptions
 
 UNREAD = 1
@@ -37,14 +40,17 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
         typer.Exit: the run is whole, but nobody reads the stream any more.
     """
     from sigmaslam.live.estimate_stream import PipeStream, open_stream
+    from sigmaslam.live.frame_sink import ThreadedSink
 
     sinks: list[FrameSink] = []
     if options.video is not None:
         sinks.append(_open_video(options.video, out, camera))
-    if options.viewer is not None:
-        sinks.append(_open_viewer(options.viewer, out, camera))
+    viewer = None if options.viewer is None else _open_viewer(options.viewer, out, camera)
     if options.dense is not None:
-        sinks.append(_open_cloud(options.dense, out, camera))
+        sinks.append(_open_cloud(options.dense, out, camera, None if viewer is None else viewer.show_cloud))
+    if viewer is not None:
+        # It is closed after the cloud, which it shows.
+        sinks.append(ThreadedSink(viewer))
     if options.stream is None:
         yield sinks
         return
@@ -74,8 +80,8 @@ def _open_video(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
     return ThreadedSink(VideoSink(path, camera))
 
 
-def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> FrameSink:
-    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
+def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
+    from sigmaslam.live.frame_sink import check_sink_path
     from sigmaslam.run_record.run_folder import RERUN_NAME
 
     name, colon, file = viewer.partition(":")
@@ -87,13 +93,15 @@ def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> FrameSink:
     path = Path(file) if file else None
     if path is not None:
         check_sink_path("--viewer", path, out, RERUN_NAME)
-    return ThreadedSink(RerunSink(path, camera))
+    return RerunSink(path, camera)
 
 
-def _open_cloud(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
+def _open_cloud(
+    path: Path, out: Path, camera: StereoCamera, show: Callable[[np.ndarray, np.ndarray], None] | None
+) -> FrameSink:
     from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
     from sigmaslam.reconstruction.live_cloud import CloudSink
     from sigmaslam.run_record.dense_points import CLOUD_NAME
 
     check_sink_path("--dense", path, out, CLOUD_NAME)
-    return ThreadedSink(CloudSink(path, out, camera))
+    return ThreadedSink(CloudSink(path, out, camera, show))

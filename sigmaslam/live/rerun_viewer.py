@@ -52,7 +52,7 @@ class RerunSink:
         self._trails, self._points = MatchTrails(), KeyframePoints(camera)
         self._positions: list[np.ndarray] = []
         self._colours: list[tuple[int, int, int]] = []
-        self._depth = 1.0
+        self._depth, self._clouds = 1.0, 0
         self._recording = rr.RecordingStream("sigmaslam")
         self._is_open = False
         if path is None:
@@ -84,6 +84,12 @@ class RerunSink:
         self._plot("milliseconds", sum(estimate.milliseconds.values()))
         if estimate.dof:
             self._plot("nis_per_dof", estimate.nis / estimate.dof)
+
+    def show_cloud(self, points: np.ndarray, grey: np.ndarray) -> None:
+        """Shows points (N, 3) of a dense cloud, metres, with their grey values (N,), from now on."""
+        colours = np.repeat(grey[:, None].astype(np.uint8), 3, axis=1)
+        self._clouds += 1
+        self._recording.log(f"world/dense/{self._clouds}", rr.Points3D(points, colors=colours), static=True)
 
     def close(self) -> None:
         """No frame comes any more. A window that was closed before is no error; a file that is not whole is."""

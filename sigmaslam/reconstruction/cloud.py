@@ -100,8 +100,10 @@ class DepthPixels(Table):
     @classmethod
     def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> DepthPixels:
         """The chosen pixels, (H, W) bool, of such images (H, W); disparities there are positive."""
-        v, u = np.nonzero(chosen)
-        return cls(np.stack([u, v], axis=-1), disparity[v, u].astype(float), variance[v, u].astype(float), image[v, u])
+        rows = np.flatnonzero(chosen)
+        values = (each.ravel()[rows] for each in (disparity, variance))
+        pixels = np.stack(np.divmod(rows, image.shape[1])[::-1], axis=-1)
+        return cls(pixels, *(each.astype(float) for each in values), image.ravel()[rows])
 
     def points(self, camera: RectifiedStereo) -> np.ndarray:
         """(N, 3) in the rectified left camera, metres."""
@@ -176,7 +178,7 @@ class VoxelCloud:
         information = inverse(cloud.covariances.astype(np.float64))
         weighted = _times(information, cloud.points)
         sums = np.column_stack([information, weighted, cloud.intensity * cloud.views, cloud.views])
-        self._pending.append(_sum_by_key(_voxels(cloud.points, cloud.sigma, self.size), sums))
+        self._pending.append((_voxels(cloud.points, cloud.sigma, self.size), sums))
         # Amortised: each point is sorted about as many times as the cloud doubles.
         if sum(len(part[0]) for part in self._pending) > len(self._merged[0]):
             self._merge()
@@ -226,9 +228,10 @@ def _voxels(points: np.ndarray, sigma: np.ndarray, size: float) -> np.ndarray:
 
 def _at_level(points: np.ndarray, level: np.ndarray | int, size: float) -> np.ndarray:
     """(N, 4) voxels of points at a level, or at one each."""
-    levels = np.broadcast_to(level, len(points))
-    cells = np.floor(points / (size * 2.0 ** levels[:, None])).astype(np.int64)
-    return np.column_stack([cells, levels])
+    cells = np.empty((len(points), 4), np.int64)
+    cells[:, 3] = level
+    cells[:, :3] = np.floor(np.ldexp(points / size, -cells[:, 3:]))
+    return cells
 
 
 def write_cloud(path: Path, cloud: DenseCloud) -> None:

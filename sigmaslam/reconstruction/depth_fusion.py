@@ -9,13 +9,14 @@ the scalar form of the Kalman filter in `sigmaslam_filters`, to which a test hol
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.reconstruction.disparity import DisparityMap, pixel_grid
+from sigmaslam.reconstruction.disparity import DisparityMap, pixel_grid, shrink, window_mean
+from sigmaslam.table import Table
 
 GATE = 6.635
 """99 % of chi-square with one degree of freedom: disparities that differ by more are of different surfaces."""
@@ -28,15 +29,18 @@ _SLOPE_RADIUS = 3
 _MIN_DEPTH = 1e-2
 # The variances themselves count as so many measurements of their scale.
 _FREEDOM = np.float32(4.0)
-# Windows in which images are compared: side, variance of what resampling moves them by, pixels squared, and of the
-# rounding of two grey values.
-_WINDOW, _RESAMPLING, _ROUNDING = np.full(7, 1.0 / 7.0, np.float32), np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
-# Variance of each component of dense optical flow, pixels squared, and 99 % of chi-square with two degrees of freedom.
-_FLOW_VARIANCE, _GATE_2D = np.float32(0.3**2), 9.21
+# Where images are compared: variance of what resampling moves them by, pixels squared, and of the rounding of two grey
+# values.
+_RESAMPLING, _ROUNDING = np.float32(1.0 / 12.0), np.float32(1.0 / 6.0)
+# One of so many pixels is enough for a median.
+_MEDIAN_STRIDE = 8
+# Variance of each component of dense optical flow, pixels squared, of images so many times smaller, and 99 % of
+# chi-square with two degrees of freedom.
+_FLOW_VARIANCE, _FLOW_SCALE, _GATE_2D = np.float32(0.3**2), 4, 9.21
 # Of the pixels whose depth is as expected, at least this share must also be where the pose says.
 _LEAST_SHARE = 0.5
-# Pixels whose variances by a pose are computed at a time: arrays of them stay in the cache of a core.
-_PART = 8192
+# Pixels that are measured at a time: arrays of them stay in the cache of a core.
+_PART = 16384
 # What a small step, translation before rotation, adds to normalised coordinates x, y and to the relative depth of a
 # point (a, b, 1) of inverse depth q: linear in q, 1, a and b, the second axis.
 _BY_STEP = np.zeros((3, 4, 6))
@@ -142,7 +146,9 @@ def fuse_depth(
     cost = np.zeros_like(mean)
     texture = _texture(image.astype(np.float32)).reshape(2, -1)[:, known]
     for view, pose, covariance in others:
-        seen = _measure(view, pose, covariance, rays, mean, variance, camera)
+        parts = [slice(first, first + _PART) for first in range(0, max(len(known), 1), _PART)]
+        measured = (_measure(view, pose, covariance, rays[:, at], mean[at], variance[at], camera) for at in parts)
+        seen = _Seen.concatenate([replace(of, rows=of.rows + at.start) for of, at in zip(measured, parts, strict=True)])
         rows = seen.rows
         noise = np.float32(1.0 - shared) * seen.noise + seen.pose
         # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
@@ -198,7 +204,7 @@ def kalman_update(
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _Seen(Table):
     """A measurement of N pixels by another view.
 
     Attributes:
@@ -207,7 +213,7 @@ class _Seen:
         innovation: (M,) that disparity minus the predicted one, pixels.
         derivative: (M,) of the latter less the former by the state.
         noise, pose: (M,) variance of the disparity seen, and of what the pose between the views adds, pixels squared.
-        place: (2, M) variance of u and v by the state and the pose, pixels squared.
+        place_u, place_v: (M,) variance of u and v by the state and the pose, pixels squared.
     """
 
     grey: np.ndarray
@@ -216,7 +222,8 @@ class _Seen:
     derivative: np.ndarray
     noise: np.ndarray
     pose: np.ndarray
-    place: np.ndarray
+    place_u: np.ndarray
+    place_v: np.ndarray
 
 
 def _measure(
@@ -239,23 +246,18 @@ def _measure(
     a, b = x * inverse, y * inverse
     u, v = camera.fx * a + np.float32(camera.cx), camera.fy * b + np.float32(camera.cy)
     predicted = state * inverse
-    sampled, grey = _sample((view.sampled, view.image), u, v)
+    *sampled, grey = _sample((view.sampled, view.image), u, v)
     rows = np.flatnonzero(np.isfinite(sampled[0]))
-    disparity, noise, slope_u, slope_v = sampled[:, rows]
+    disparity, noise, slope_u, slope_v = (each[rows] for each in sampled)
     a, b, inverse, predicted, variance, ahead = (each[rows] for each in (a, b, inverse, predicted, variance, turned[2]))
     # By the state: of the predicted disparity, and of the one seen where the prediction moves to.
     moves_u = np.float32(camera.fx) * (shift[0] - a * shift[2]) * inverse
     moves_v = np.float32(camera.fy) * (shift[1] - b * shift[2]) * inverse
     derivative = ahead * inverse**2 - slope_u * moves_u - slope_v * moves_v
-    place = np.stack([moves_u**2 * variance, moves_v**2 * variance])
     factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)].astype(np.float32)
-    by_pose = np.empty_like(predicted)
-    for first in range(0, len(rows), _PART):
-        part = slice(first, first + _PART)
-        slopes = slope_u[part], slope_v[part]
-        by_pose[part], *by_place = _pose_variances(factors, a[part], b[part], predicted[part], *slopes, camera)
-        place[:, part] += by_place
-    return _Seen(grey, rows, disparity - predicted, derivative, noise, by_pose, place)
+    by_pose, place_u, place_v = _pose_variances(factors, a, b, predicted, slope_u, slope_v, camera)
+    place_u, place_v = moves_u**2 * variance + place_u, moves_v**2 * variance + place_v
+    return _Seen(grey, rows, disparity - predicted, derivative, noise, by_pose, place_u, place_v)
 
 
 def _pose_variances(
@@ -304,36 +306,32 @@ def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.
     weight, difference = np.zeros((2, *image.shape), np.float32)
     weight.ravel()[pixels] = 1.0
     difference.ravel()[pixels] = image.ravel()[pixels] - grey
-    share, mean, square = (_mean(each).ravel()[measured] for each in (weight, difference, difference**2))
+    share, mean, square = (window_mean(each).ravel()[measured] for each in (weight, difference, difference**2))
     share = np.maximum(share, np.float32(1e-3))
-    place_u, place_v = seen.place + _RESAMPLING
-    expected = _ROUNDING + texture[0, seen.rows] * place_u + texture[1, seen.rows] * place_v
+    place_u, place_v = seen.place_u + _RESAMPLING, seen.place_v + _RESAMPLING
+    expected = _ROUNDING + texture[0][seen.rows] * place_u + texture[1][seen.rows] * place_v
     ratio = (square / share - (mean / share) ** 2) / expected
-    alike = ratio <= GATE * (np.median(ratio) if len(ratio) else 0.0)
+    alike = ratio <= GATE * (np.median(ratio[::_MEDIAN_STRIDE]) if len(ratio) else 0.0)
     # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
     warped = image.copy()
     warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
-    nothing = np.zeros((*image.shape, 2), np.float32)
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    flow_u, flow_v = cv2.split(flow.calc(image, warped, nothing))
-    rests = flow_u.ravel()[measured] ** 2 / (place_u + _FLOW_VARIANCE)
-    rests += flow_v.ravel()[measured] ** 2 / (place_v + _FLOW_VARIANCE)
+    small = [shrink(each, _FLOW_SCALE) for each in (image, warped)]
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    search.setFinestScale(0)
+    flow = cv2.split(search.calc(*small, np.zeros((*small[0].shape, 2), np.float32)))
+    moved_u, moved_v = (_FLOW_SCALE * cv2.resize(each, image.shape[::-1]).ravel()[measured] for each in flow)
+    rests = moved_u**2 / (place_u + _FLOW_VARIANCE) + moved_v**2 / (place_v + _FLOW_VARIANCE)
     return np.asarray(alike & (rests <= _GATE_2D))
 
 
 def _texture(image: np.ndarray) -> np.ndarray:
     """Mean squared derivatives by u and v in the window of each pixel, (2, H, W), grey values^2 / pixel^2."""
     step = np.array([[-0.5, 0.0, 0.5]], np.float32)
-    return np.stack([_mean(cv2.filter2D(image, -1, kernel) ** 2) for kernel in (step, step.T)])
-
-
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Means over the window of each pixel."""
-    return np.asarray(cv2.sepFilter2D(values, -1, _WINDOW, _WINDOW))
+    return np.stack([window_mean(cv2.filter2D(image, -1, kernel) ** 2) for kernel in (step, step.T)])
 
 
 def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
-    """Bilinear values of images (H, W) or (H, W, C) at N pixels, NaN where one around is; (N,) or (C, N) of each."""
+    """Bilinear values of images (H, W) or (H, W, C) at N pixels, NaN where one around is; (N,) of each channel."""
     # OpenCV takes maps of at most 32767 columns.
     columns = 1024
     rows = -(-len(u) // columns)
@@ -343,8 +341,7 @@ def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[
     sampled = []
     for image in images:
         found = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR, borderValue=(np.nan,) * 4)
-        channels = [each.ravel()[: len(u)] for each in cv2.split(found)]
-        sampled.append(channels[0] if image.ndim == 2 else np.stack(channels))
+        sampled += [each.ravel()[: len(u)] for each in cv2.split(found)]
     return sampled
 
 

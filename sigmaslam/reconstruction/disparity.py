@@ -23,8 +23,9 @@ _CAP = 63
 _UNIQUE, _SPECKLE = 5, 100
 # Disparities searched: from behind infinity, for the sake of a disparity offset, to nearer than all of half the image.
 _LEAST, _BEYOND = -4, 8
-# The largest disparity that half the image is searched for, as a share of its width, and which of them counts.
-_WIDEST, _NEARLY_ALL = 0.4, 99.8
+# How far to search is found at a quarter of the size, or at so many columns; the largest disparity as a share of these,
+# and which of those found counts.
+_COLUMNS, _WIDEST, _NEARLY_ALL = 160, 0.4, 99.8
 # Alignment: radius of the window, steps, and how far one may go, pixels.
 _RADIUS, _STEPS, _LONGEST = 3, 2, 0.5
 _WINDOW = np.full(2 * _RADIUS + 1, 1.0 / (2 * _RADIUS + 1), np.float32)
@@ -139,11 +140,17 @@ def semi_global_disparity(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     Args:
         left, right: (H, W) uint8 rectified images.
     """
-    small = [cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA) for image in (left, right)]
-    known = _seen_by_both(small[0], small[1], _WIDEST * small[0].shape[1])
+    smaller = max(left.shape[1] / _COLUMNS, 4.0)
+    small = [shrink(image, smaller) for image in (left, right)]
+    known = _seen_by_both(small[0], small[1], _WIDEST * small[0].shape[1], (4.0 / smaller) ** 2)
     known = known[np.isfinite(known)]
-    largest = 4.0 * float(np.percentile(known, _NEARLY_ALL)) + _BEYOND if len(known) else 0.0
+    largest = smaller * float(np.percentile(known, _NEARLY_ALL)) + _BEYOND if len(known) else 0.0
     return _semi_global(left, right, max(largest, _BEYOND))
+
+
+def shrink(image: np.ndarray, smaller: float) -> np.ndarray:
+    """The image so many times smaller."""
+    return np.asarray(cv2.resize(image, None, fx=1.0 / smaller, fy=1.0 / smaller, interpolation=cv2.INTER_AREA))
 
 
 def _half_size_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> np.ndarray:
@@ -155,19 +162,19 @@ def _half_size_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndar
     found = disparity[np.isfinite(disparity)]
     if not len(found):
         return np.full((height, width), np.nan, np.float32)
-    halves = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (left, right)]
-    both = _seen_by_both(halves[0], halves[1], float(found.max()) / 2.0)
+    both = _seen_by_both(shrink(left, 2.0), shrink(right, 2.0), float(found.max()) / 2.0)
     return 2.0 * cv2.resize(both, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
-def _seen_by_both(left: np.ndarray, right: np.ndarray, largest: float) -> np.ndarray:
+def _seen_by_both(left: np.ndarray, right: np.ndarray, largest: float, speckle: float = 1.0) -> np.ndarray:
     """(H, W) disparities that matching from the right image to the left one finds, too, within a pixel; else NaN.
 
+    Speckles are `speckle` times as large as those of the whole image.
     Skies and plain walls match anywhere, mostly far off.
     """
-    there = _semi_global(left, right, largest)
+    there = _semi_global(left, right, largest, speckle)
     mirrored_left, mirrored_right = (np.ascontiguousarray(image[:, ::-1]) for image in (left, right))
-    back = _semi_global(mirrored_right, mirrored_left, largest)[:, ::-1]
+    back = _semi_global(mirrored_right, mirrored_left, largest, speckle)[:, ::-1]
     v, u = np.nonzero(np.isfinite(there))
     u_right = np.rint(u - there[v, u]).astype(np.int64).clip(0, left.shape[1] - 1)
     differs = ~(np.abs(back[v, u_right] - there[v, u]) <= 1.0)
@@ -175,7 +182,7 @@ def _seen_by_both(left: np.ndarray, right: np.ndarray, largest: float) -> np.nda
     return there
 
 
-def _semi_global(left: np.ndarray, right: np.ndarray, largest: float) -> np.ndarray:
+def _semi_global(left: np.ndarray, right: np.ndarray, largest: float, speckle: float = 1.0) -> np.ndarray:
     levels = 16 * int(np.ceil((largest - _LEAST) / 16))
     matcher = cv2.StereoSGBM.create(
         minDisparity=_LEAST,
@@ -186,7 +193,7 @@ def _semi_global(left: np.ndarray, right: np.ndarray, largest: float) -> np.ndar
         disp12MaxDiff=1,
         preFilterCap=_CAP,
         uniquenessRatio=_UNIQUE,
-        speckleWindowSize=_SPECKLE,
+        speckleWindowSize=round(speckle * _SPECKLE),
         speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
@@ -219,11 +226,11 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     # What is saturated shows no texture, and its edges are not where the surface's are.
     seen = cv2.remap(right, u - smooth, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     weight = (known & (left < _SATURATED) & (seen < _SATURATED)).astype(np.float32)
-    share = _mean(weight)
+    share = window_mean(weight)
     inverse = np.float32(1.0) / np.maximum(share, np.float32(1e-3))
 
     def mean(weighted: np.ndarray) -> np.ndarray:
-        return _mean(weighted) * inverse
+        return window_mean(weighted) * inverse
 
     pixels = (2 * _RADIUS + 1) ** 2 * np.maximum(share, np.float32(1e-3))
     counted = reference * weight
@@ -251,7 +258,7 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     # What the last step began with, about the smooth surface.
     relief = np.where(known, np.minimum(np.abs(departs - smooth), _SAME_SURFACE), np.float32(0.0)) ** 2
     bound = np.minimum(noise / texture, _WIDEST_BOUND)
-    inverse = np.float32(1.0) / np.maximum(_mean(known.astype(np.float32)), np.float32(1e-3))
+    inverse = np.float32(1.0) / np.maximum(window_mean(known.astype(np.float32)), np.float32(1e-3))
     aligned = np.where(known, found, np.float32(0.0))
     edge = np.minimum(np.abs(aligned - mean(aligned)), _WIDEST_EDGE) ** 2
     return Alignment(
@@ -312,6 +319,6 @@ def pixel_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
+def window_mean(values: np.ndarray) -> np.ndarray:
     """Means over the window of each pixel."""
     return np.asarray(cv2.sepFilter2D(values, -1, _WINDOW, _WINDOW))

@@ -1,5 +1,6 @@
 """A dense cloud that is made while a run goes on, of keyframes as soon as two views behind them are there."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +30,13 @@ class CloudSink:
         path: PLY file of the cloud.
         run: folder of the run, whose report shows it.
         camera: of the run.
+        show: takes points (N, 3) of each keyframe, metres, and their grey values (N,).
     """
 
-    def __init__(self, path: Path, run: Path, camera: StereoCamera) -> None:
-        self.name = str(path)
+    def __init__(
+        self, path: Path, run: Path, camera: StereoCamera, show: Callable[[np.ndarray, np.ndarray], None] | None = None
+    ) -> None:
+        self.name, self._show = str(path), show
         self._path, self._run, self._camera = path, run, camera
         self._rectifier = StereoRectifier(camera)
         self._cloud: VoxelCloud | None = None
@@ -77,7 +81,10 @@ class CloudSink:
         views = {k: (image, view) for k, (_, image, view) in enumerate(self._views)}
         depth = fuse_keyframe(number, views, self._recorded(), self._rectifier)
         self._cloud = self._cloud or VoxelCloud(default_voxel(depth, self._rectifier.rectified))
-        self._cloud.add(depth.cloud(self._rectifier.rectified, self._cloud.size))
+        points = depth.cloud(self._rectifier.rectified, self._cloud.size)
+        self._cloud.add(points)
+        if self._show is not None:
+            self._show(points.points, points.intensity)
         self._keyframes += 1
 
     def _recorded(self) -> RecordedKeyframes:

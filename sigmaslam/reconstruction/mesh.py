@@ -83,6 +83,8 @@ class DepthVolume:
             raise InputError(f"{path}: no point is near enough for a mesh: leave --mesh out, or give a larger --voxel")
         mesh = self._grid.extract_triangle_mesh(weight_threshold=_LEAST_WEIGHT).to_legacy()
         mesh.compute_vertex_normals()
+        # Means of white exceed one by their rounding.
+        mesh.vertex_colors = self._library.utility.Vector3dVector(np.clip(mesh.vertex_colors, 0.0, 1.0))
         with atomic_path(path) as temporary:
             if not self._library.io.write_triangle_mesh(str(temporary), mesh):
                 raise InputError(f"{path}: Open3D could not write the mesh: choose another place")

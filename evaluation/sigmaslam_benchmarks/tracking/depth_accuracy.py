@@ -19,7 +19,8 @@ class JudgedPixels(Table):
     Attributes:
         fused_error, single_error: (N,) of the depth after fusion and of the single view's, as a share of the true one;
             NaN where there is none.
-        sigmas: (N,) error of the fused inverse depth, in its standard deviations; NaN where there is none.
+        sigmas, sigmas_alone: (N,) error of the fused inverse depth, in its standard deviations, with and without that
+            of the disparity offset; NaN where there is none.
         error_mm, sigma_mm: (N,) of the fused depth along the optical axis, millimetres; the sigma holds that of the
             disparity offset. NaN where there is none.
         is_point: (N,) bool, the pixel became a point of the cloud.
@@ -29,6 +30,7 @@ class JudgedPixels(Table):
     fused_error: np.ndarray
     single_error: np.ndarray
     sigmas: np.ndarray
+    sigmas_alone: np.ndarray
     error_mm: np.ndarray
     sigma_mm: np.ndarray
     is_point: np.ndarray
@@ -46,7 +48,10 @@ class DepthFigures:
         completeness: share of the pixels at rest seen by both eyes that became points.
         gross: share of the points whose depth is off by more than a tenth.
         ghosts: share of the pixels on moving bodies that became points; NaN where nothing moves.
-        error_mm, sigma_mm: medians of the absolute errors and of the sigmas of the points' depths, millimetres.
+        error_mm, error95_mm: median and 95th percentile of the absolute errors of the points' depths, millimetres.
+        sigma_mm: median of the sigmas of the points' depths, millimetres.
+        within, within_alone: shares of the points inside one and two sigma, and inside those without the part of the
+            disparity offset.
         keyframes: that were judged.
     """
 
@@ -57,7 +62,10 @@ class DepthFigures:
     gross: float
     ghosts: float
     error_mm: float
+    error95_mm: float
     sigma_mm: float
+    within: tuple[float, float]
+    within_alone: tuple[float, float]
     keyframes: int
 
 
@@ -87,6 +95,7 @@ def judge_pixels(
             true / fused - 1.0,
             true / alone - 1.0,
             (fused - true) / np.sqrt(depth.variance[rows]),
+            (fused - true) / np.sqrt(depth.fused.variance[rows]),
             1e3 * truth[rows] * (true / fused - 1.0),
             1e3 * truth[rows] * np.sqrt(depth.variance[rows]) / fused,
             depth.is_point[rows],
@@ -107,6 +116,15 @@ def summarise(pixels: JudgedPixels, keyframes: int) -> DepthFigures:
         float(np.mean(np.abs(points.fused_error) > 0.1)) if len(points) else none,
         float(pixels.is_point[pixels.moves].mean()) if pixels.moves.any() else none,
         float(np.median(np.abs(points.error_mm))) if len(points) else none,
+        float(np.percentile(np.abs(points.error_mm), 95)) if len(points) else none,
         float(np.median(points.sigma_mm)) if len(points) else none,
+        _within(points.sigmas),
+        _within(points.sigmas_alone),
         keyframes,
     )
+
+
+def _within(sigmas: np.ndarray) -> tuple[float, float]:
+    """Shares inside one and two sigma."""
+    one, two = (float(np.mean(np.abs(sigmas) < many)) if len(sigmas) else float("nan") for many in (1, 2))
+    return one, two

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +42,17 @@ def format_page(
         missing=missing,
         goals=_goals(sequences),
         worlds=[_world(world, sequences) for world in dict.fromkeys(each.world for each in sequences)],
-        organs=_rigid_organs(sequences),
         sequences=len(sequences),
     )
+
+
+def format_organs(
+    sequences: Sequence[ReconstructedSequence], seeds: int, command: str, missing: Sequence[str] = ()
+) -> str:
+    """The page of rigid organs; arguments as those of `format_page`."""
+    rows = [_in_millimetres(str(each.seed), each.figures) for each in sequences]
+    rows.append(_in_millimetres("median", _medians(sequences)))
+    return fill_page("reconstruction_organ", command, seeds=seeds, missing=missing, rows=rows)
 
 
 def _goals(sequences: Sequence[ReconstructedSequence]) -> list[list[str]]:
@@ -63,22 +72,18 @@ def _world(world: str, sequences: Sequence[ReconstructedSequence]) -> list[str]:
     return [world, str(len(of_world)), *_cells(_medians(of_world))]
 
 
-def _rigid_organs(sequences: Sequence[ReconstructedSequence]) -> list[list[str]]:
-    """Of each organ in which nothing moves on its own, in millimetres."""
-    rigid = [(str(each.seed), each.figures) for each in sequences if each.world == "organ" and not each.movers]
-    return [
-        [seed, f"{of.error_mm:.2f}", f"{of.sigma_mm:.2f}", f"{of.inside:.1%}", f"{of.completeness:.0%}"]
-        for seed, of in rigid
-    ]
+def _in_millimetres(name: str, of: DepthFigures) -> list[str]:
+    errors = [f"{each:.2f}" for each in (of.error_mm, of.error95_mm, of.sigma_mm)]
+    return [name, *errors, *(f"{each:.1%}" for each in (*of.within, *of.within_alone)), f"{of.completeness:.0%}"]
 
 
 def _medians(sequences: Sequence[ReconstructedSequence]) -> DepthFigures:
     """Of the sequences that have each figure; NaN where none has."""
 
-    def median(name: str) -> float:
-        values = np.array([getattr(each.figures, name) for each in sequences])
-        known = values[np.isfinite(values)]
-        return float(np.median(known)) if len(known) else math.nan
+    def median(name: str) -> Any:
+        values = np.array([getattr(each.figures, name) for each in sequences], float)
+        known = values[np.isfinite(values).reshape(len(values), -1).all(axis=1)]
+        return np.median(known, axis=0) if len(known) else np.full(values.shape[1:], math.nan)
 
     names = [each.name for each in fields(DepthFigures) if each.name != "keyframes"]
     medians = {name: median(name) for name in names}

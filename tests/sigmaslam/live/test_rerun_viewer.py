@@ -64,6 +64,20 @@ def test_the_camera_is_where_the_trajectory_says_at_the_time_of_the_frame(run, l
     assert [row["frame"] for row in rows] == list(range(FRAMES))
 
 
+@pytest.mark.long
+def test_dense_points_of_keyframes_are_shown(demo_sequence: Path, tmp_path: Path):
+    chunk = pytest.importorskip("rerun.chunk")
+    source = copy_frames(demo_sequence, tmp_path / "sequence", FRAMES)
+    file = tmp_path / "seen.rrd"
+    done = run_here(
+        *("track", source, "--out", tmp_path / "run", "--dense", tmp_path / "cloud.ply", "--viewer", f"rerun:{file}")
+    )
+    assert done.returncode == 0, done.stderr
+    shown = [each for each in chunk.RrdReader(file).stream().to_chunks() if "/dense/" in each.entity_path]
+    keyframes = read_frames(tmp_path / "run" / "frames.csv").columns["keyframe"].sum()
+    assert len({each.entity_path for each in shown}) == keyframes > 0
+
+
 def test_ellipsoids_hold_three_sigma_of_the_position(run, logged):
     covariances = np.load(run / "covariance.npy")
     found = column(logged["world/sigma"], "half_sizes")

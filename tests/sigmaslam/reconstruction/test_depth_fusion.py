@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 import torch
 
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -116,6 +117,19 @@ def test_a_pose_that_most_of_the_image_denies_confirms_nothing():
     view = DepthView.of(moved, measure(true, 1))
     fused = fuse_depth(image, measure(true, 0), [(view, np.eye(4), 1e-12 * np.eye(6))], CAMERA)
     assert not fused.is_confirmed.any()
+
+
+def test_pixels_are_measured_alike_whatever_their_number_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    image, true = plane(np.eye(4))
+    seen, disparity = plane(STEP)
+    other = DepthView.of(seen, measure(disparity, 1)), se3_inverse(STEP), 1e-6 * np.eye(6)
+    whole, parts = [], []
+    for found, part in ((whole, 1 << 20), (parts, 999)):
+        monkeypatch.setattr(depth_fusion, "_PART", part)
+        fused = fuse_depth(image, measure(true, 0), [other], CAMERA)
+        found += [fused.disparity, fused.variance, fused.support]
+    for one, another in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(one, another, rtol=1e-5)
 
 
 def test_the_derivative_and_the_pose_s_part_are_those_of_differences():

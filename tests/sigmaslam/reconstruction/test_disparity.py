@@ -67,6 +67,13 @@ def test_what_the_right_image_does_not_show_has_no_disparity():
     assert np.isfinite(found[10:-10, 30:-10]).mean() > 0.9
 
 
+def test_a_near_body_in_a_wide_image_widens_the_search_whatever_the_size_it_is_looked_for_at():
+    true = np.full((2 * HEIGHT, 6 * WIDTH), 10.0, np.float32)
+    true[30:120, 700:790] = 90.0
+    found = semi_global_disparity(*textured_pair(true, noise=1.0))
+    assert np.mean(np.abs(found - true)[35:115, 710:780] < 1.0) > 0.8
+
+
 def test_chance_matches_of_one_direction_do_not_widen_the_search(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(disparity, "_SPECKLE", 0)
     rng = np.random.default_rng(3)

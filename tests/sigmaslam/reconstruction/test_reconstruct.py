@@ -11,12 +11,16 @@ from onnx import TensorProto, helper
 from scipy.spatial import cKDTree
 
 from sigmaslam.errors import InputError
+from sigmaslam.readers import open_sequence
+from sigmaslam.reconstruction.live_cloud import CloudSink
 from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.run_record.dense_points import read_dense_points
 from sigmaslam.run_record.recorded_run import read_run
+from sigmaslam.runs.request import LiveOptions
 from tests.support.commands import run_here
 from tests.support.demo_parts import copy_frames
+from tests.support.tracked import track
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +83,23 @@ def test_a_cloud_made_while_tracking_is_near_that_of_later_and_changes_no_pose(t
     assert np.median(distance / live.sigma) < 0.5
     assert run_here("track", tracked / "input", "--out", tmp_path / "run", "--overwrite").returncode == 0
     assert not (tmp_path / "run" / "cloud.ply").exists()
+
+
+@pytest.mark.long
+def test_each_keyframe_s_points_are_shown_as_they_come_and_lie_on_the_cloud(tracked: Path, tmp_path: Path):
+    shown: list[np.ndarray] = []
+    sequence = open_sequence(tracked / "input")
+
+    def show(points: np.ndarray, grey: np.ndarray) -> None:
+        assert len(points) == len(grey)
+        shown.append(points)
+
+    sink = CloudSink(tmp_path / "cloud.ply", tmp_path / "run", sequence.camera, show)
+    track(sequence, tmp_path / "run", "klt", live=LiveOptions(sinks=[sink]))
+    dense = read_dense_points(tmp_path / "run" / "dense.npz")
+    assert len(shown) == read_recorded_keyframes(tmp_path / "run").count > 1
+    distance = cKDTree(np.concatenate(shown)).query(dense.points)[0]
+    assert np.quantile(distance / dense.sigma, 0.99) < 1.0
 
 
 def test_an_input_that_has_moved_is_asked_for_and_taken(tracked: Path, tmp_path: Path):
