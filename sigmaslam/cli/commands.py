@@ -21,7 +21,7 @@ FIRST = {
     "check": "Look at an input before it is tracked.",
     "track": "Track a stereo sequence, recorded or live.",
     "evaluate": "Compare a trajectory with the truth.",
-    "report": "Make the report of a run anew, or of one that was killed.",
+    "report": "Make the report of a run anew, or compare several runs.",
     "calibrate": "Calibrate cameras; show, convert or use a calibration.",
 }
 GROUPS = {

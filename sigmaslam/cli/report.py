@@ -9,18 +9,23 @@ from sigmaslam.cli.run_summary import tell_summary
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Run folder of `sigmaslam track`.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Run folder of `sigmaslam track`, or up to six.")],
+    out: Annotated[Path, typer.Option(help="Page that compares several runs.")] = Path("comparison.html"),
 ) -> None:
-    """Make report.html of a run anew; of one that was killed, or whose disk was full, all results that it lacks.
+    """Make report.html of a run anew, or one page that compares several runs.
 
-    Every pose until then is there. The map and the trajectory after the fact are lost: track again if you need them.
-    Exit codes as of track.
+    Of a run that was killed, or whose disk was full, all results are made that it lacks. Every pose until then is
+    there. The map and the trajectory after the fact are lost: track again if you need them. Exit codes as of track.
     """
     from sigmaslam.report.report import write_report
     from sigmaslam.runs.finish import finish_run
+    from sigmaslam_evaluation.comparison import write_comparison
 
-    summary = finish_run(run)
-    if summary is None:
-        typer.echo(f"Report: {write_report(run)}")
-    else:
-        tell_summary(summary, run)
+    finished = [(run, finish_run(run)) for run in runs]
+    if len(runs) > 1:
+        typer.echo(f"Report: {write_comparison(runs, out)}")
+    for run, summary in finished:
+        if summary is not None:
+            tell_summary(summary, run)
+        elif len(runs) == 1:
+            typer.echo(f"Report: {write_report(run)}")

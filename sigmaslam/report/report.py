@@ -22,8 +22,8 @@ from sigmaslam.report.report_facts import (
     list_refinement,
     list_statuses,
 )
-from sigmaslam.report.report_plots import build_plots, draw_step
-from sigmaslam.report.report_scene import build_scene, pack
+from sigmaslam.report.report_plots import MAX_FRAMES, build_plots, thin
+from sigmaslam.report.report_scene import build_scene
 from sigmaslam.run_record.frame_pictures import FramePictures
 from sigmaslam.run_record.frame_table import STATUSES, FrameTable
 from sigmaslam.run_record.recorded_run import RecordedRun, read_run
@@ -74,28 +74,31 @@ def write_report(run_dir: str | Path) -> Path:
     """
     folder = Path(run_dir)
     run = read_run(folder)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sigmaslam.report", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    assets = files("sigmaslam.report") / "assets"
-    plots, scene = build_plots(run), build_scene(run)
-    pictures = _pictures(run)
-    head, rows = list_evaluation(run)
-    text = environment.get_template("report.html").render(
+    scene, pictures = build_scene(run), _pictures(run)
+    state, (head, rows) = judge(run), list_evaluation(run)
+    page = {
+        "intervals": _intervals(run.frames),
+        "statuses": STATUSES,
+        "pictures": pictures,
+        "picture_size": [] if run.pictures is None else run.pictures.size,
+        "picture_magnification": PICTURE_MAGNIFICATION,
+    }
+    return write_page(
+        folder / REPORT_NAME,
+        "report.html",
+        [run.frames.seconds],
+        build_plots(run),
+        [] if scene is None else [scene],
+        page,
         name=printable(folder.resolve().name),
-        state=judge(run),
+        kind=state.kind,
+        state=state,
         facts=list_facts(run),
         statuses=list_statuses(run),
         contradiction=contradiction_verdict(run.summary),
         verdict=run.summary.get("calibration_verdict"),
         calibration=list_calibration(run),
         inertial=list_inertial(run),
-        scene=scene,
-        plots=plots,
         pictures=pictures,
         evaluation_head=head,
         evaluation_rows=rows,
@@ -106,29 +109,58 @@ def write_report(run_dir: str | Path) -> Path:
         machine=list_machine(run),
         links=[(name, words) for name, words in _LINKED if (folder / name).is_file()],
         configuration=_configuration(run.entries),
+    )
+
+
+def write_page(
+    path: Path,
+    template: str,
+    seconds: list[np.ndarray],
+    plots: list[dict[str, Any]],
+    scenes: list[dict[str, Any]],
+    page: dict[str, Any],
+    **words: Any,
+) -> Path:
+    """Write a page of time line, view and plots, with its styles and scripts inside.
+
+    Args:
+        path: of the page.
+        template: name of one that extends `page.html`.
+        seconds: times of the frames of each run.
+        plots: of `build_plots`; a series is of the run `run`, by default the first.
+        scenes: of `build_scene`, of each run that has poses.
+        page: what else the scripts need.
+        **words: what else the template needs.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sigmaslam.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    assets = files("sigmaslam.report") / "assets"
+    most = MAX_FRAMES // len(seconds)
+    for series in (each for plot in plots for each in plot["series"]):
+        series["values"] = thin(series["values"], most)
+    page = {"seconds": [thin(each, most) for each in seconds], "plots": plots, "scenes": scenes, **page}
+    text = environment.get_template(template).render(
+        scenes=scenes,
+        plots=plots,
         styles=Markup("\n".join((assets / name).read_text(encoding="utf-8") for name in _STYLES)),
         scripts=[Markup((assets / name).read_text(encoding="utf-8")) for name in _SCRIPTS],
-        page=_to_json(
-            {
-                "seconds": pack(run.frames.seconds[:: draw_step(len(run.frames))]),
-                "intervals": _intervals(run.frames),
-                "statuses": STATUSES,
-                "plots": plots,
-                "scene": scene,
-                "pictures": pictures,
-                "picture_size": [] if run.pictures is None else run.pictures.size.tolist(),
-                "picture_magnification": PICTURE_MAGNIFICATION,
-            }
-        ),
+        # A "<" could end the script element in which the text stands.
+        page=Markup(json.dumps(page, separators=(",", ":"), allow_nan=False, default=_pack).replace("<", "\\u003c")),
+        **words,
     )
-    path = folder / REPORT_NAME
     atomic_write_text(path, text)
     return path
 
 
-def _to_json(page: dict[str, Any]) -> Markup:
-    """JSON that cannot end the script element it stands in."""
-    return Markup(json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
+def _pack(array: np.ndarray) -> dict[str, str]:
+    """An array for the JSON of a page; numbers become float32, and truth values and bytes uint8."""
+    kind = "|u1" if array.dtype in (np.uint8, np.bool_) else "<f4"
+    return {"dtype": kind, "base64": base64.b64encode(np.ascontiguousarray(array).astype(kind).tobytes()).decode()}
 
 
 def _configuration(entries: dict[str, Any]) -> str | None:
@@ -183,11 +215,11 @@ def _picture(run: RecordedRun, pictures: FramePictures, index: int, row: int, wo
         "why": f"{status}, {seconds:.2f} s" if not np.isfinite(score) else f"NIS {score:+.1f} σ, {seconds:.2f} s",
         "left": _data_url(left),
         "right": _data_url(right) if right else None,
-        "pixels": pack(pictures.pixels[part]),
-        "covariance": pack(pictures.covariance[part]),
-        "probability": pack(pictures.probability[part]),
-        "inlier": pack(pictures.inlier[part]),
-        "trail": pack(pictures.trail[part]),
+        "pixels": pictures.pixels[part],
+        "covariance": pictures.covariance[part],
+        "probability": pictures.probability[part],
+        "inlier": pictures.inlier[part],
+        "trail": pictures.trail[part],
     }
 
 

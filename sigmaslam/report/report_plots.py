@@ -7,19 +7,18 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_BAND_OF_6
 from sigmaslam.plot_style import BLUE, GREEN, GREY, SERIES, VERMILLION
-from sigmaslam.report.report_scene import pack
 from sigmaslam.run_record.frame_table import FrameTable
 from sigmaslam.run_record.recorded_run import RecordedRun
 
 MAX_FRAMES = 20_000
-"""With more frames an even selection is drawn."""
+"""Of one run; with more an even selection is drawn."""
 # A scale is logarithmic where the largest value is so many times the median.
 _WIDE = 100.0
 
 
-def draw_step(count: int) -> int:
-    """One frame of so many is drawn."""
-    return max(1, -(-count // MAX_FRAMES))
+def thin(values: np.ndarray, most: int = MAX_FRAMES) -> np.ndarray:
+    """An even selection of at most so many values, those of all frames."""
+    return values[:: max(1, -(-len(values) // most))]
 
 
 def nis_per_dof(frames: FrameTable) -> np.ndarray:
@@ -29,7 +28,10 @@ def nis_per_dof(frames: FrameTable) -> np.ndarray:
 
 
 def build_plots(run: RecordedRun) -> list[dict[str, Any]]:
-    """Title, caption, series and bands of each plot that has data."""
+    """Title, caption, series and bands of each plot that has data.
+
+    Series that are of interest beside those of another run say in `compared` what they are, if the title does not.
+    """
     plots = [
         *_sigmas(run),
         _nees(run),
@@ -44,7 +46,7 @@ def build_plots(run: RecordedRun) -> list[dict[str, Any]]:
 
 
 def _line(label: str, values: np.ndarray, colour: str, **style: Any) -> dict[str, Any]:
-    return {"label": label, "colour": colour, "values": pack(values[:: draw_step(len(values))]), **style}
+    return {"label": label, "colour": colour, "values": values, **style}
 
 
 def _plot(title: str, caption: str, series: list[dict[str, Any]], **options: Any) -> dict[str, Any]:
@@ -61,29 +63,21 @@ def _is_wide(values: np.ndarray) -> bool:
     return bool(len(values) and values.max() > _WIDE * np.median(values))
 
 
-def _sigmas(run: RecordedRun) -> list[dict[str, Any] | None]:
+def _sigmas(run: RecordedRun) -> list[dict[str, Any]]:
     """3 sigma of position and rotation, with their errors where there is a truth."""
-    plots: list[dict[str, Any] | None] = []
-    errors = run.evaluated
-    kinds = (("Position", "m", 1.0), ("Rotation", "deg", float(np.degrees(1.0))))
+    plots, errors = [], run.evaluated
+    kinds = (("position", "m", 1.0), ("rotation", "deg", float(np.degrees(1.0))))
     for (kind, unit, scale), sigma in zip(kinds, run.sigmas, strict=True):
         claimed = run.of_frames(3.0 * scale * sigma)
-        title, caption = f"{kind}: 3 sigma [{unit}]", "Of the pose in the world, as it was said with the frame."
-        series = [_line("3 sigma", claimed, BLUE, width=2)]
-        values = claimed
+        caption = "3 sigma are those of the pose in the world, as it was said with the frame."
+        series = [_line("3 sigma", claimed, BLUE, width=2, compared="3 sigma")]
         if errors is not None:
-            error = scale * (errors.position_error if kind == "Position" else errors.rotation_error)
-            found = run.of_frames(error, errors.row)
-            title = f"{kind}: error and 3 sigma [{unit}]"
+            error = scale * (errors.position_error if kind == "position" else errors.rotation_error)
             caption += " The error is that of the pose relative to the first one with a truth."
-            series.append(_line("error", found, VERMILLION, width=2))
-            values = np.concatenate([claimed, found])
-        is_log = _is_wide(values)
-        if is_log:  # which has no zero
-            series = [{**each} for each in series]
-            for each, line in zip(series, (claimed, values[len(claimed) :]), strict=False):
-                each["values"] = pack(np.where(line > 0, line, np.nan)[:: draw_step(len(line))])
-        plots.append(_plot(title, caption, series, log=is_log) if _has_numbers(claimed) else None)
+            series.append(_line("error", run.of_frames(error, errors.row), VERMILLION, width=2, compared="error"))
+        if _has_numbers(claimed):
+            is_wide = _is_wide(np.concatenate([each["values"] for each in series]))
+            plots.append(_plot(f"Error of the {kind} [{unit}]", caption, series, log=is_wide))
     return plots
 
 
@@ -103,13 +97,12 @@ def _nees(run: RecordedRun) -> dict[str, Any] | None:
         "Normalised estimation error squared, per degree of freedom: 1 is right, above the band the covariance is too "
         "small. The band holds 95 % of a right one's."
     )
-    series = [*_band(low, high, "95 %"), _line("NEES / dof", np.where(ratio > 0, ratio, np.nan), BLUE, dots=True)]
+    series = [*_band(low, high, "95 %"), _line("NEES / dof", ratio, BLUE, dots=True, compared="")]
     return _plot("NEES", caption, series, log=True, bands=_BANDS)
 
 
 def _nis(frames: FrameTable) -> dict[str, Any] | None:
     ratio = nis_per_dof(frames)
-    ratio = np.where(ratio > 0, ratio, np.nan)
     if not _has_numbers(ratio):
         return None
     # (chi2 / dof)^(1/3) is nearly normal (Wilson and Hilferty).
@@ -120,7 +113,7 @@ def _nis(frames: FrameTable) -> dict[str, Any] | None:
         "Normalised innovation squared, per degree of freedom: about 1 where the claimed uncertainty is right, above "
         "the band where it is too small. The band holds 95 % of the frames of a consistent filter."
     )
-    series = [*_band(low, high, "95 %"), _line("NIS / dof", ratio, BLUE, dots=True)]
+    series = [*_band(low, high, "95 %"), _line("NIS / dof", ratio, BLUE, dots=True, compared="")]
     return _plot("NIS", caption, series, log=True, bands=_BANDS)
 
 
@@ -128,7 +121,7 @@ def _inliers(frames: FrameTable) -> dict[str, Any] | None:
     matches, inliers = frames.columns["matches"], frames.columns["inliers"]
     if not _has_numbers(matches, inliers):
         return None
-    series = [_line("matches", matches, BLUE), _line("inliers", inliers, VERMILLION)]
+    series = [_line("matches", matches, BLUE), _line("inliers", inliers, VERMILLION, compared="")]
     return _plot("Matches and inliers", "Inliers are the matches that the filter used.", series)
 
 
@@ -139,7 +132,7 @@ def _offset(frames: FrameTable) -> dict[str, Any] | None:
     series = [
         _line("+ 2 sigma", offset + 2 * sigma, GREY, width=0.5),
         _line("- 2 sigma", offset - 2 * sigma, GREY, width=0.5),
-        _line("offset", offset, BLUE, width=2),
+        _line("offset", offset, BLUE, width=2, compared=""),
     ]
     bands = [{"series": [1, 2], "fill": "rgb(0 114 178 / 18%)"}]
     return _plot("Disparity offset [px]", "Estimated error of the calibration.", series, bands=bands)
@@ -179,7 +172,7 @@ def _belief(frames: FrameTable) -> dict[str, Any] | None:
     if not _has_numbers(belief):
         return None
     caption = "How far the tracker believes each of its poses, 0 to 1."
-    return _plot("Belief", caption, [_line("belief", belief, BLUE)], range=[-0.03, 1.03])
+    return _plot("Belief", caption, [_line("belief", belief, BLUE, compared="")], range=[-0.03, 1.03])
 
 
 def _times(frames: FrameTable) -> dict[str, Any] | None:
@@ -190,7 +183,14 @@ def _times(frames: FrameTable) -> dict[str, Any] | None:
     stacked[:, ~np.isfinite(frames.total_milliseconds)] = np.nan
     # The tallest first, so that each covers those above it down to its own.
     series = [
-        _line(f"to {names[k].replace('_', ' ')}", stacked[k], SERIES[k % 6], width=1, fill=f"{SERIES[k % 6]}66")
+        _line(
+            f"to {names[k].replace('_', ' ')}",
+            stacked[k],
+            SERIES[k % 6],
+            width=1,
+            fill=f"{SERIES[k % 6]}66",
+            **({"compared": ""} if k == len(names) - 1 else {}),
+        )
         for k in reversed(range(len(names)))
     ]
     caption = "Stages one upon the other."

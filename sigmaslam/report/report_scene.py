@@ -1,6 +1,5 @@
 """The 3D view of a report: what stands where."""
 
-import base64
 from typing import Any
 
 import numpy as np
@@ -18,25 +17,24 @@ MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _VISIBLE = 0.02
 
 
-def pack(array: np.ndarray) -> dict[str, str]:
-    """An array for the JSON of a page; numbers become float32, and truth values and bytes uint8."""
-    kind = "|u1" if array.dtype in (np.uint8, np.bool_) else "<f4"
-    return {"dtype": kind, "base64": base64.b64encode(np.ascontiguousarray(array).astype(kind).tobytes()).decode()}
-
-
-def build_scene(run: RecordedRun) -> dict[str, Any] | None:
+def build_scene(run: RecordedRun, most: int = MAX_POSES, start: float | None = None) -> dict[str, Any] | None:
     """Path, ellipsoids, map points, keyframes and loops; None where no frame has a pose.
 
     Of a run that follows a body the path is the body's, and its points are where it was last.
+
+    Args:
+        run: the run.
+        most: poses of its path.
+        start: time stamp of 0 s; by default that of the first frame.
     """
     if not len(run.trajectory):
         return None
     positions = run.trajectory.positions
-    shown = _even(len(positions), MAX_POSES)
+    shown = _even(len(positions), most)
     # A short loss stays visible in a selection.
     lost = np.flatnonzero(np.array(run.pose_status) == "lost")
-    shown = np.union1d(shown, lost[_even(len(lost), MAX_POSES)])
-    seconds = run.trajectory.timestamps - run.frames.columns["timestamp"][0]
+    shown = np.union1d(shown, lost[_even(len(lost), most)])
+    seconds = run.trajectory.timestamps - (run.frames.columns["timestamp"][0] if start is None else start)
     status = np.array([STATUSES.index(each) for each in run.pose_status], np.uint8)
     low, high = _extent(run)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
@@ -46,26 +44,26 @@ def build_scene(run: RecordedRun) -> dict[str, Any] | None:
         "centre": (0.5 * (low + high)).tolist(),
         "extent": (high - low).tolist(),
         "size": size,
-        "path": pack(positions[shown]),
-        "path_seconds": pack(seconds[shown]),
-        "path_status": pack(status[shown]),
+        "path": positions[shown],
+        "path_seconds": seconds[shown],
+        "path_status": status[shown],
         "labels": _labels(run, seconds, shown),
-        "ellipsoids": pack(ellipsoids),
-        "ellipsoid_status": pack(status[chosen]),
+        "ellipsoids": ellipsoids,
+        "ellipsoid_status": status[chosen],
         "magnification": _magnification(run, size),
         "magnifications": MAGNIFICATIONS,
-        "keyframes": pack(keyframes),
-        "loops": pack(loops),
+        "keyframes": keyframes,
+        "loops": loops,
         **_points(run),
     }
     if run.dense is not None:
-        scene |= {"dense": pack(run.dense.points), "dense_grey": pack(run.dense.intensity)}
+        scene |= {"dense": run.dense.points, "dense_grey": run.dense.intensity}
     others: dict[str, np.ndarray | None] = {
         "truth": None if run.evaluated is None else run.evaluated.truth,
         "final": _positions(run.final),
         "refined": _positions(run.refined),
     }
-    return scene | {name: pack(line[_even(len(line), MAX_POSES)]) for name, line in others.items() if line is not None}
+    return scene | {name: line[_even(len(line), most)] for name, line in others.items() if line is not None}
 
 
 def _even(count: int, most: int) -> np.ndarray:
@@ -99,14 +97,14 @@ def _placed_points(run: RecordedRun) -> np.ndarray:
 def _points(run: RecordedRun) -> dict[str, Any]:
     """Map points, their sigmas, and their grey values where they are known."""
     if run.map is None:
-        return {"points": pack(np.zeros((0, 3))), "point_sigma": pack(np.zeros(0)), "point_grey": None}
+        return {"points": np.zeros((0, 3)), "point_sigma": np.zeros(0), "point_grey": None}
     shown = _even(len(run.map.points), MAX_POINTS)
     grey = run.map.intensity[shown]
     known = np.isfinite(grey).all()
     return {
-        "points": pack(_placed_points(run)[shown]),
-        "point_sigma": pack(run.map.sigma[shown]),
-        "point_grey": pack(grey.astype(np.uint8)) if known else None,
+        "points": _placed_points(run)[shown],
+        "point_sigma": run.map.sigma[shown],
+        "point_grey": grey.astype(np.uint8) if known else None,
     }
 
 

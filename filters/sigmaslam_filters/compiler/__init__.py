@@ -15,8 +15,8 @@ Private parts of torch that are used, each listed with its signature in that tes
 What is rewritten: `components` writes the traced aten graph of a step anew, one array (B,) for each number, where the
 batch is on a CPU, has 64 elements or more and no derivative is asked for. `number_program` makes a program of numbers
 of a function of small tensors; `scalar_step` writes it and its derivative backward as C++ functions of one element,
-`item_source` as a loop's body. `event_kinds` says which events share one, `scalar_sequence` calls them over time,
-`header_export` hands them out.
+`release/item_source.py` as a loop's body. `event_kinds` says which events share one, `scalar_sequence` calls them over
+time, `header_export` hands them out.
 
 What is guaranteed: the arithmetic is the library's, operation by operation, so results agree to 3e-14 of the largest
 value in float64. A model is taken as it is when the step is compiled. What fails is said as the library says it.

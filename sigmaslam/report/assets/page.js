@@ -20,8 +20,8 @@ function select(seconds, from) {
   for (const plot of plots) plot.setCursor({ left: plot.valToPos(seconds, "x"), top: 10 }, false);
 }
 
-if (page.scene) {
-  scene = buildScene(document.getElementById("scene"), page.scene, select);
+if (page.scenes.length) {
+  scene = buildScene(document.getElementById("scene"), page.scenes, select);
   const press = (button, on) => button.setAttribute("aria-pressed", String(on));
   document.querySelectorAll("[data-layer]").forEach((button) => button.addEventListener("click", () => {
     const on = button.getAttribute("aria-pressed") !== "true";
@@ -35,9 +35,7 @@ if (page.scene) {
     document.querySelectorAll("[data-colour]").forEach((each) => press(each, each === button));
     scene?.colourBy(button.dataset.colour);
   }));
-  if (scene && page.scene.path_seconds.length) {
-    timeline = buildTimeline(page.scene.path_seconds, page.scene.labels, (seconds) => select(seconds, "timeline"));
-  }
+  if (scene) timeline = buildTimeline(page.scenes, (seconds) => select(seconds, "timeline"));
   const magnification = document.getElementById("magnification");
   magnification.addEventListener("change", () => scene?.magnify(+magnification.value));
 }
@@ -48,5 +46,5 @@ if (page.pictures.length) {
 page.plots.forEach((plot, k) => {
   plots.push(buildPlot(document.getElementById(`plot-${k}`), page.seconds, page.intervals, plot, select));
 });
-if (timeline) select(page.scene.path_seconds.at(-1));
+if (timeline) select(Math.max(...page.scenes.map((each) => each.path_seconds.at(-1))));
 window.report = { page, scene, frames, plots, timeline };

@@ -1,5 +1,6 @@
 "use strict";
-// The 3D view: path by status, ellipsoids, map points, keyframes, loops; y of the world points down.
+// The 3D view: paths by status, or of several runs by run, ellipsoids, map points, keyframes, loops; y of the world
+// points down.
 // Colours by number of the status, as in `statuses` of the page's data.
 const STATUS_COLOURS = ["#9aa3ad", "#3fa7f0", "#ff6a3d", "#e08bc0", "#6b7280", "#f0d03f", "#b57bff", "#4fc3a1",
   "#a1c34f"];
@@ -39,7 +40,7 @@ function pathLines(scene, dash) {
     const guess = LOST_STATUSES.has(scene.path_status[k]) || (k > 1 && LOST_STATUSES.has(scene.path_status[k - 1]));
     const [positions, colours] = parts[guess ? "guess" : "sure"];
     const status = guess && !LOST_STATUSES.has(scene.path_status[k]) ? scene.path_status[k - 1] : scene.path_status[k];
-    const colour = new THREE.Color(STATUS_COLOURS[status]);
+    const colour = new THREE.Color(scene.colour ?? STATUS_COLOURS[status]);
     positions.push(...scene.path.subarray(3 * k - 3, 3 * k + 3));
     for (let end = 0; end < 2; end++) colours.push(colour.r, colour.g, colour.b);
   }
@@ -105,7 +106,7 @@ function ellipsoids(scene) {
     const material = new THREE.MeshLambertMaterial({ transparent: true, opacity, depthWrite: false });
     const mesh = new THREE.InstancedMesh(new THREE.SphereGeometry(1, 32, 24), material, count);
     mesh.frustumCulled = false;
-    for (let k = 0; k < count; k++) mesh.setColorAt(k, new THREE.Color(STATUS_COLOURS[scene.ellipsoid_status[k]]));
+    for (let k = 0; k < count; k++) mesh.setColorAt(k, new THREE.Color(scene.colour ?? STATUS_COLOURS[scene.ellipsoid_status[k]]));
     return mesh;
   });
   const group = new THREE.Group();
@@ -136,7 +137,9 @@ function surfaces(scene) {
   return new THREE.Points(cloud, new THREE.PointsMaterial({ size, vertexColors: true }));
 }
 
-function buildScene(box, scene, select) {
+// Centre and size are those of the first scene, which has the map.
+function buildScene(box, scenes, select) {
+  const scene = scenes[0];
   let renderer;
   try {
     renderer = new THREE.WebGLRenderer({ antialias: true });
@@ -157,7 +160,9 @@ function buildScene(box, scene, select) {
   sun.position.set(-1, -2, -1);
   world.add(sun);
 
-  const layers = { path: pathLines(scene, scene.size / 90), ellipsoids: ellipsoids(scene) };
+  const layers = {}, clouds = scenes.map(ellipsoids);
+  scenes.forEach((each, k) => { layers[`path-${k}`] = pathLines(each, scene.size / 90); });
+  layers.ellipsoids = new THREE.Group().add(...clouds);
   const cloud = new THREE.BufferGeometry();
   cloud.setAttribute("position", new THREE.BufferAttribute(scene.points, 3));
   const colourBy = (by) => cloud.setAttribute("color", new THREE.BufferAttribute(mapPoints(scene, by), 3));
@@ -167,25 +172,32 @@ function buildScene(box, scene, select) {
   if (scene.dense) layers.dense = surfaces(scene);
   layers.grid = grid(scene);
   box.querySelector(".scale").textContent = `grid: ${length(layers.grid.spacing)}`;
-  layers.keyframes = frustums(scene, scene.size / 130);
-  layers.loops = lineSegments(scene.loops, null, { linewidth: 2, color: "#ffb000" });
-  for (const [name, colour] of [["truth", "#00c08a"], ["final", "#f0e442"], ["refined", "#e0aaff"]]) {
-    if (scene[name]) layers[name] = polyline(scene[name], { linewidth: 1.6, color: colour });
+  if (!scene.colour) {
+    layers.keyframes = frustums(scene, scene.size / 130);
+    layers.loops = lineSegments(scene.loops, null, { linewidth: 2, color: "#ffb000" });
+  }
+  for (const [name, colour] of [["truth", scene.colour ? "#f5f5f5" : "#00c08a"], ["final", "#f0e442"], ["refined", "#e0aaff"]]) {
+    const line = scenes.find((each) => each[name]);
+    if (line) layers[name] = polyline(line[name], { linewidth: 1.6, color: colour });
   }
   Object.values(layers).forEach((layer) => world.add(layer));
   const tips = [0, 1, 2].map((axis) => new THREE.Vector3().setComponent(axis, scene.size / 14).toArray());
   const hues = [[1, 0.25, 0.25], [0.2, 0.85, 0.3], [0.35, 0.5, 1]];
   world.add(lineSegments(tips.flatMap((end) => [0, 0, 0, ...end]), hues.flatMap((hue) => [...hue, ...hue]),
     { linewidth: 2.5 }));
-  const marker = new THREE.Mesh(new THREE.SphereGeometry(1, 16, 12), new THREE.MeshBasicMaterial({ color: "#ffffff" }));
-  marker.visible = false;
-  world.add(marker);
+  const markers = scenes.map((each) => {
+    const material = new THREE.MeshBasicMaterial({ color: each.colour ?? "#ffffff" });
+    const marker = new THREE.Mesh(new THREE.SphereGeometry(1, 16, 12), material);
+    marker.visible = false;
+    world.add(marker);
+    return marker;
+  });
 
   const tip = box.querySelector(".tip");
   let asked = false;
   const draw = () => {
     asked = false;
-    marker.scale.setScalar(camera.position.distanceTo(marker.position) / 130);
+    for (const marker of markers) marker.scale.setScalar(camera.position.distanceTo(marker.position) / 130);
     renderer.render(world, camera);
   };
   const redraw = () => { if (!asked) { asked = true; requestAnimationFrame(draw); } };
@@ -218,11 +230,13 @@ function buildScene(box, scene, select) {
     return best;
   };
   const describe = (x, y) => {
-    const frame = nearest(scene.path, x, y);
-    if (frame >= 0) return [scene.labels[frame], frame];
-    if (!layers.points.visible) return ["", -1];
+    for (const [k, each] of scenes.entries()) {
+      const frame = layers[`path-${k}`].visible ? nearest(each.path, x, y) : -1;
+      if (frame >= 0) return [(each.name ? `${each.name}: ` : "") + each.labels[frame], each.path_seconds[frame]];
+    }
+    if (!layers.points.visible) return ["", null];
     const point = nearest(scene.points, x, y);
-    return [point < 0 ? "" : `map point, sigma ${length(scene.point_sigma[point])}`, -1];
+    return [point < 0 ? "" : `map point, sigma ${length(scene.point_sigma[point])}`, null];
   };
   const place = (event) => {
     const edge = box.getBoundingClientRect();
@@ -237,8 +251,8 @@ function buildScene(box, scene, select) {
     tip.style.top = `${Math.max(y - 34, 4)}px`;
   });
   box.addEventListener("click", (event) => {
-    const [, frame] = describe(...place(event));
-    if (frame >= 0) select(scene.path_seconds[frame]);
+    const [, seconds] = describe(...place(event));
+    if (seconds !== null) select(seconds);
   });
   controls.addEventListener("change", redraw);
   new ResizeObserver(resize).observe(box);
@@ -249,17 +263,17 @@ function buildScene(box, scene, select) {
     look: (name) => view(views[name]),
     show: (name, visible) => { if (layers[name]) layers[name].visible = visible; redraw(); },
     colourBy: (by) => { colourBy(by); redraw(); },
-    magnify: (factor) => { layers.ellipsoids.magnify(factor); redraw(); },
+    magnify: (factor) => { for (const cloud of clouds) cloud.magnify(factor); redraw(); },
     select: (seconds, follow) => {
-      const times = scene.path_seconds;
-      let k = 0;
-      while (k + 1 < times.length && Math.abs(times[k + 1] - seconds) <= Math.abs(times[k] - seconds)) k++;
-      if (!times.length) return;
-      marker.position.fromArray(scene.path, 3 * k);
-      marker.visible = true;
-      if (follow) {
-        camera.position.add(marker.position).sub(controls.target);
-        controls.target.copy(marker.position);
+      scenes.forEach((each, k) => {
+        const frame = nearestFrame(each.path_seconds, seconds);
+        markers[k].visible = frame >= 0;
+        if (frame >= 0) markers[k].position.fromArray(each.path, 3 * frame);
+      });
+      const followed = markers.find((marker) => marker.visible);
+      if (follow && followed) {
+        camera.position.add(followed.position).sub(controls.target);
+        controls.target.copy(followed.position);
         controls.update();
       }
       redraw();

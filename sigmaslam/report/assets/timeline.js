@@ -1,20 +1,29 @@
 "use strict";
+// The frame of a run at a time; -1 before its first and after its last one.
+function nearestFrame(times, seconds) {
+  let k = 0;
+  while (k + 1 < times.length && Math.abs(times[k + 1] - seconds) <= Math.abs(times[k] - seconds)) k++;
+  return seconds < times[0] - 1e-3 || seconds > times[times.length - 1] + 1e-3 ? -1 : k;
+}
+
 // One time for the whole page: a slider, play and keys move it; views, plots and pictures follow.
-function buildTimeline(seconds, labels, chosen) {
+function buildTimeline(scenes, chosen) {
+  const seconds = [...new Set(scenes.flatMap((scene) => Array.from(scene.path_seconds)))].sort((a, b) => a - b);
   const [bar, slider, play, speed, about] = ["timeline", "time", "play", "speed", "time-text"].map((id) => document.getElementById(id));
   let now = seconds.length - 1, playing = false, started = 0, from = 0;
 
   const show = (index) => {
     now = Math.min(Math.max(index, 0), seconds.length - 1);
     slider.value = now;
-    about.textContent = labels[now].replace("\n", ", ");
+    const lines = scenes.map((scene) => {
+      const frame = nearestFrame(scene.path_seconds, seconds[now]);
+      const label = frame < 0 ? "no pose" : scene.labels[frame].replace("\n", ", ");
+      return scene.name ? `${scene.name}: ${label}` : label;
+    });
+    about.textContent = lines.join("\n");
   };
   const go = (index) => { show(index); chosen(seconds[now]); };
-  const nearest = (time) => {
-    let k = 0;
-    while (k + 1 < seconds.length && Math.abs(seconds[k + 1] - time) <= Math.abs(seconds[k] - time)) k++;
-    return k;
-  };
+  const nearest = (time) => nearestFrame(seconds, Math.min(Math.max(time, seconds[0]), seconds[seconds.length - 1]));
   const step = (clock) => {
     if (!playing) return;
     const time = from + ((clock - started) / 1000) * +speed.value;

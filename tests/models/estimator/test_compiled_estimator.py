@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import sigmaslam.estimation
+from release.view_source import write_views
 from sigmaslam.estimation import estimator_graphs
 from sigmaslam.estimation.estimator_graphs import open_step
 from sigmaslam.inference.backends import load_step
 from sigmaslam_models.estimator.estimator_export import estimator_graphs as traced_modules
 from sigmaslam_models.estimator.graph_examples import frame_example, window_example
-from sigmaslam_models.estimator.view_source import write_views
 
 FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
 WINDOW_STEPS = ("window_eliminate", "window_gate")
@@ -76,7 +76,7 @@ def test_gated_step_stops_where_it_confirms_the_inliers(inputs):
 @pytest.mark.long
 def test_view_source_is_that_of_the_modules():
     written = Path(sigmaslam.estimation.__file__).with_name("views.inc").read_text()
-    assert write_views() == written, "run python -m sigmaslam_models.estimator.view_source and compile again"
+    assert write_views() == written, "run python -m release.view_source and compile again"
 
 
 def test_graphs_serve_without_a_compiler(monkeypatch, caplog):

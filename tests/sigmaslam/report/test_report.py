@@ -1,8 +1,5 @@
-import base64
 import json
-from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,62 +10,18 @@ from sigmaslam.report.report import write_report
 from sigmaslam.run_record.evaluated_frames import EvaluatedFrames, write_evaluation
 from sigmaslam.run_record.frame_table import STATUSES, read_frames
 from sigmaslam.run_record.recorded_run import read_run
+from tests.support.pages import Page, unpack
 from tests.support.recorded_runs import HEADER, STAGES, make_run
 
-MOST_BYTES = 8_000_000
+MOST_BYTES = 6_000_000
 
 
-class _Page(HTMLParser):
-    """Checks that tags close and collects text, links and identifiers."""
-
-    def __init__(self, content: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text: list[str] = []
-        self.links: list[str] = []
-        self.identifiers: list[str] = []
-        self.data: dict[str, Any] = {}
-        self.feed(content)
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in ("meta", "br", "link", "input"):
-            self.open.append(tag)
-        self._attributes(attrs)
-
-    def handle_startendtag(self, tag, attrs):
-        self._attributes(attrs)
-
-    def _attributes(self, attrs):
-        self.links += [value for name, value in attrs if name in ("src", "href", "xlink:href")]
-        self.identifiers += [value for name, value in attrs if name == "id"]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] in ("script", "style"):
-            if data.startswith('{"seconds"'):
-                self.data = json.loads(data)
-            return
-        self.text.append(data)
-
-
-def _page(run: Path) -> _Page:
-    return _Page(write_report(run).read_text(encoding="utf-8"))
+def _page(run: Path) -> Page:
+    return Page(write_report(run).read_text(encoding="utf-8"))
 
 
 def _text(run: Path) -> str:
-    return " ".join(" ".join(_page(run).text).split())
-
-
-def _unpack(packed: dict[str, str], *shape: int) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(packed["base64"]), packed["dtype"]).reshape(-1, *shape)
-
-
-def _values(page: _Page, title: str, label: str) -> np.ndarray:
-    """The numbers of a series in a plot."""
-    plot = next(plot for plot in page.data["plots"] if plot["title"].startswith(title))
-    return _unpack(next(each for each in plot["series"] if each["label"] == label)["values"])
+    return _page(run).words
 
 
 @pytest.mark.long
@@ -79,14 +32,14 @@ def test_report_is_one_file_that_needs_no_other(tmp_path, count):
     (tmp_path / "run/run.json").write_text(json.dumps({"weights": weights}))
     path = write_report(tmp_path / "run")
     assert path.stat().st_size <= MOST_BYTES
-    page = _Page(path.read_text(encoding="utf-8"))
+    page = Page(path.read_text(encoding="utf-8"))
     assert page.open == []
     assert all(link.startswith("data:") or (tmp_path / "run" / link).is_file() for link in page.links)
     assert len(page.identifiers) == len(set(page.identifiers))
     titles = [plot["title"] for plot in page.data["plots"]]
     assert titles == [
-        "Position: 3 sigma [m]",
-        "Rotation: 3 sigma [deg]",
+        "Error of the position [m]",
+        "Error of the rotation [deg]",
         "NIS",
         "Matches and inliers",
         "Disparity offset [px]",
@@ -143,8 +96,8 @@ def test_a_run_that_was_stopped_says_so(tmp_path):
 
 def test_ellipsoids_are_the_covariances_of_positions_in_the_world(tmp_path):
     make_run(tmp_path / "run")
-    scene = _page(tmp_path / "run").data["scene"]
-    transforms = _unpack(scene["ellipsoids"], 4, 4).astype(float)
+    scene = _page(tmp_path / "run").data["scenes"][0]
+    transforms = unpack(scene["ellipsoids"], 4, 4).astype(float)
     run = read_run(tmp_path / "run")
     rows = [np.linalg.norm(run.trajectory.positions - T[:3, 3], axis=1).argmin() for T in transforms]
     assert len(set(rows)) == len(transforms) == 40
@@ -156,18 +109,18 @@ def test_ellipsoids_are_the_covariances_of_positions_in_the_world(tmp_path):
 
 def test_the_view_shows_path_keyframes_loop_and_points(tmp_path):
     make_run(tmp_path / "run", points=500)
-    scene = _page(tmp_path / "run").data["scene"]
+    scene = _page(tmp_path / "run").data["scenes"][0]
     trajectory = read_tum(tmp_path / "run/trajectory.tum")
-    np.testing.assert_allclose(_unpack(scene["path"], 3), trajectory.positions, atol=1e-4)
-    assert [STATUSES[k] for k in _unpack(scene["path_status"])].count("lost") == 5
+    np.testing.assert_allclose(unpack(scene["path"], 3), trajectory.positions, atol=1e-4)
+    assert [STATUSES[k] for k in unpack(scene["path_status"])].count("lost") == 5
     # Every tenth frame is a keyframe; the skipped one, 50, has no pose.
-    np.testing.assert_allclose(_unpack(scene["keyframes"], 4, 4)[1], trajectory.poses[10], atol=1e-4)
-    assert len(_unpack(scene["keyframes"], 4, 4)) == 19
-    np.testing.assert_allclose(_unpack(scene["loops"], 2, 3), [trajectory.positions[[-1, 1]]], atol=1e-4)
+    np.testing.assert_allclose(unpack(scene["keyframes"], 4, 4)[1], trajectory.poses[10], atol=1e-4)
+    assert len(unpack(scene["keyframes"], 4, 4)) == 19
+    np.testing.assert_allclose(unpack(scene["loops"], 2, 3), [trajectory.positions[[-1, 1]]], atol=1e-4)
     with np.load(tmp_path / "run/map.npz") as content:
-        np.testing.assert_allclose(_unpack(scene["points"], 3), content["points"], atol=1e-4)
-        np.testing.assert_array_equal(_unpack(scene["point_grey"]), content["intensity"])
-    np.testing.assert_allclose(_unpack(scene["point_sigma"]), 1.0)
+        np.testing.assert_allclose(unpack(scene["points"], 3), content["points"], atol=1e-4)
+        np.testing.assert_array_equal(unpack(scene["point_grey"]), content["intensity"])
+    np.testing.assert_allclose(unpack(scene["point_sigma"]), 1.0)
 
 
 def test_points_of_a_followed_body_are_where_it_was_last(tmp_path):
@@ -176,7 +129,7 @@ def test_points_of_a_followed_body_are_where_it_was_last(tmp_path):
     last = read_tum(tmp_path / "run/trajectory.tum").poses[-1]
     with np.load(tmp_path / "run/map.npz") as content:
         expected = content["points"] @ last[:3, :3].T + last[:3, 3]
-    found = _unpack(_page(tmp_path / "run").data["scene"]["points"], 3)
+    found = unpack(_page(tmp_path / "run").data["scenes"][0]["points"], 3)
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
@@ -187,16 +140,19 @@ def test_a_loss_of_one_frame_is_seen_in_a_long_run(tmp_path):
     lines = path.read_text().splitlines()
     lines[7001] = lines[7001].replace("tracking", "lost")
     path.write_text("\n".join(lines) + "\n")
-    scene = _page(tmp_path / "run").data["scene"]
-    assert [STATUSES[k] for k in _unpack(scene["path_status"])].count("lost") == 6
+    scene = _page(tmp_path / "run").data["scenes"][0]
+    assert [STATUSES[k] for k in unpack(scene["path_status"])].count("lost") == 6
 
 
 def test_sigmas_are_those_of_the_covariance(tmp_path):
     make_run(tmp_path / "run")
     page = _page(tmp_path / "run")
     variances = np.diagonal(np.load(tmp_path / "run/covariance.npy"), axis1=1, axis2=2)
-    for title, part, unit in (("Position", slice(0, 3), 1.0), ("Rotation", slice(3, 6), 180 / np.pi)):
-        drawn = _values(page, title, "3 sigma")
+    for title, part, unit in (
+        ("Error of the position", slice(0, 3), 1.0),
+        ("Error of the rotation", slice(3, 6), 180 / np.pi),
+    ):
+        drawn = page.values(title, "3 sigma")
         assert np.flatnonzero(np.isnan(drawn)).tolist() == [50]
         np.testing.assert_allclose(np.delete(drawn, 50), 3 * unit * np.sqrt(variances[:, part].sum(axis=1)), rtol=1e-5)
 
@@ -211,7 +167,7 @@ def test_an_evaluation_is_in_the_report(tmp_path):
     verdict = {"kind": "warn", "text": "NEES over 20 s is 16: so it is."}
     write_evaluation(run, {**errors, "final": None, "truth_hint": None, "nees_verdict": verdict}, frames)
     page = _page(run)
-    text = " ".join(" ".join(page.text).split())
+    text = page.words
     html = (run / "report.html").read_text()
     assert '<div class="warn"><dt>NEES per dof' in html
     assert '<span class="state warn">' in html
@@ -219,10 +175,12 @@ def test_an_evaluation_is_in_the_report(tmp_path):
     assert "as it was said 0.1234 0.1234 0.5 0.01 2.50 40 %" in text
     assert "NEES per dof 2.50" in text
     # A frame is skipped before the first of them.
-    np.testing.assert_allclose(_values(page, "Position", "error")[61 : 61 + count], line, atol=1e-6)
-    np.testing.assert_allclose(_values(page, "Rotation", "error")[61 : 61 + count], np.degrees(0.1 * line), rtol=1e-5)
-    np.testing.assert_allclose(_values(page, "NEES", "NEES / dof")[61 : 61 + count], 2 * line + 0.1, rtol=1e-5)
-    np.testing.assert_allclose(_unpack(page.data["scene"]["truth"], 3)[:, 0], line, atol=1e-6)
+    np.testing.assert_allclose(page.values("Error of the position", "error")[61 : 61 + count], line, atol=1e-6)
+    np.testing.assert_allclose(
+        page.values("Error of the rotation", "error")[61 : 61 + count], np.degrees(0.1 * line), rtol=1e-5
+    )
+    np.testing.assert_allclose(page.values("NEES", "NEES / dof")[61 : 61 + count], 2 * line + 0.1, rtol=1e-5)
+    np.testing.assert_allclose(unpack(page.data["scenes"][0]["truth"], 3)[:, 0], line, atol=1e-6)
 
 
 def test_a_refinement_is_in_the_report(tmp_path):
@@ -232,10 +190,12 @@ def test_a_refinement_is_in_the_report(tmp_path):
     (tmp_path / "run/refine.json").write_text(json.dumps(found))
     (tmp_path / "run/trajectory_refined.tum").write_text((tmp_path / "run/trajectory.tum").read_text())
     page = _page(tmp_path / "run")
-    text = " ".join(" ".join(page.text).split())
+    text = page.words
     assert "landmarks 80" in text
     assert "cost per dof 3 → 1.25" in text
-    np.testing.assert_array_equal(_unpack(page.data["scene"]["refined"], 3), _unpack(page.data["scene"]["path"], 3))
+    np.testing.assert_array_equal(
+        unpack(page.data["scenes"][0]["refined"], 3), unpack(page.data["scenes"][0]["path"], 3)
+    )
 
 
 def test_runs_of_earlier_versions_have_a_report(tmp_path):
@@ -247,8 +207,8 @@ def test_runs_of_earlier_versions_have_a_report(tmp_path):
     np.savez(tmp_path / "run/map.npz", points=np.ones((4, 3)))
     (tmp_path / "run/covariance.npy").unlink()
     page = _page(tmp_path / "run")
-    assert page.data["scene"]["point_grey"] is None
-    assert page.data["scene"]["ellipsoids"]["base64"] == ""
+    assert page.data["scenes"][0]["point_grey"] is None
+    assert page.data["scenes"][0]["ellipsoids"]["base64"] == ""
     assert "keyframes" not in _text(tmp_path / "run").partition("Frames by status")[0]
 
 
@@ -280,7 +240,7 @@ def test_run_without_map_and_configuration_has_a_report(tmp_path):
     (tmp_path / "run/map.npz").unlink()
     (tmp_path / "run/run.json").unlink()
     page = _page(tmp_path / "run")
-    assert page.data["scene"]["points"]["base64"] == ""
+    assert page.data["scenes"][0]["points"]["base64"] == ""
     assert "map.npz" not in page.links
     assert "run.json" not in _text(tmp_path / "run")
 
@@ -293,7 +253,7 @@ def test_run_with_only_skipped_frames_has_a_report(tmp_path):
         (tmp_path / "run" / name).unlink()
     page = _page(tmp_path / "run")
     assert page.data["plots"] == []
-    assert page.data["scene"] is None
+    assert page.data["scenes"] == []
     assert "2 skipped," in _text(tmp_path / "run")
     assert "Run run failed" in _text(tmp_path / "run")
 

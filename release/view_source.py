@@ -10,14 +10,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from release.item_source import write_functions
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE
-from sigmaslam_filters.compiler.item_source import write_functions
 from sigmaslam_models.estimator.frame_update import NOISE_SCALE_RULES, ROBUST_SCALES, FrameViews, linearised, predicted
 from sigmaslam_models.estimator.window_solution import WindowViews, agreeing, whitened
 
 SIZE = CALIBRATION_SIZE + 12
-_HEAD = "// Made by sigmaslam_models.estimator.view_source; do not edit.\n\n"
+_HEAD = "// Made by release.view_source; do not edit.\n\n"
 
 
 def write_views() -> str:
