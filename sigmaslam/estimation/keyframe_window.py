@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from sigmaslam.estimation.calibration_correction import judge_calibration
-from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, CalibrationPrior, measured_errors
+from sigmaslam.estimation.calibration_errors import CalibrationPrior, measured_errors
 from sigmaslam.estimation.calibration_evidence import CalibrationEvidence, Cause
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
@@ -94,21 +94,6 @@ class KeyframeWindow:
 
     def __len__(self) -> int:
         return len(self.posterior)
-
-    @property
-    def considered_growth(self) -> np.ndarray:
-        """(15,) what columns of considered errors are multiplied by in covariances that are published.
-
-        Poses are estimated without: larger baselines and focal lengths, which no image shows, would move them.
-        """
-        whole, beside = self.calibration.sigma, self.corrected[1]
-        usual = np.sqrt(np.maximum(whole**2 - beside**2, 0.0)) * np.where(np.isin(ERRORS, OF_PAIR), self.worse, 1.0)
-        return np.where(whole > 0.0, np.hypot(usual, beside) / np.where(whole > 0.0, whole, 1.0), 1.0)
-
-    @property
-    def published(self) -> WindowState:
-        """The posterior with considered errors as large as images show them to be."""
-        return self.posterior if self.worse == 1.0 else self.posterior.with_larger_errors(self.considered_growth)
 
     def restart(self, past: PastPoses | None = None) -> None:
         """Forgets all poses and landmarks, but not the calibration; `past` are poses of another run to begin with."""

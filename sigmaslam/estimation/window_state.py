@@ -46,10 +46,6 @@ class WindowState:
         """(n, n) covariance with the part of the considered errors."""
         return np.asarray(self.covariance + self.common @ self.common.T)
 
-    def with_larger_errors(self, growth: np.ndarray) -> WindowState:
-        """The same where considered errors are larger by factors (15,)."""
-        return replace(self, common=self.common * growth, past=replace(self.past, common=self.past.common * growth))
-
     @property
     def all_poses(self) -> PastPoses:
         """The marginalised poses, and behind them those of the window."""
@@ -165,6 +161,11 @@ class WindowState:
 def loop_difference(state: WindowState, index: int, T_past_last: np.ndarray) -> np.ndarray:
     """(6,) by which the last pose must move in the world to agree with a measurement from a marginalised one."""
     return np.asarray(se3_log(state.past.poses[index] @ T_past_last @ se3_inverse(state.poses[-1])))
+
+
+def scale_considered(state: WindowState, growth: np.ndarray) -> WindowState:
+    """The same where considered errors of the calibration are larger by factors (15,)."""
+    return replace(state, common=state.common * growth, past=replace(state.past, common=state.past.common * growth))
 
 
 def scale_variances(state: WindowState, factor: float) -> WindowState:

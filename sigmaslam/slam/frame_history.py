@@ -17,6 +17,7 @@ from sigmaslam.estimation.gaussian import regression
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice
 from sigmaslam.estimation.motion_smoothing import MotionLink, SmoothedMotion, smooth_motion
+from sigmaslam.estimation.published_state import published_state
 from sigmaslam.estimation.relative_covariance import relative_to_first
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
@@ -146,7 +147,7 @@ class FrameHistory:
             self._links.append(link)
         for gone in [each for each in self._chain if each not in ids]:
             self._forget(gone, ids)
-        self._ids, self._state = ids, self._window.published
+        self._ids, self._state = ids, published_state(self._window)
         self._timestamps.append(estimate.timestamp)
 
     def final(self) -> tuple[Trajectory, np.ndarray]:

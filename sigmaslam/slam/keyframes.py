@@ -13,6 +13,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.marginalised_poses import step_between
+from sigmaslam.estimation.published_state import published_state
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.frontend.patch_disparity_range import dense_disparity
@@ -149,7 +150,7 @@ class Keyframes:
         """All landmarks so far that were seen at least three times, in the world of the window."""
         for anchor, keyframe in enumerate(self.active):
             keyframe.measure_surfaces(self._window.landmarks, anchor)
-        past = points_in_world([keyframe.points for keyframe in self.remembered], self._window.published.past)
+        past = points_in_world([keyframe.points for keyframe in self.remembered], published_state(self._window).past)
         points = window_points(self._window, _times(self.active))
         for keyframe in self.active:
             points = points.shade(keyframe.view.left, keyframe.timestamp)
@@ -172,7 +173,9 @@ class Keyframes:
     def pack(self, frontend: str, camera: RectifiedStereo) -> dict[str, Any]:
         """All of them as arrays by name, by which a later run finds its place in the map."""
         keyframes = [*self.remembered, *self.active]
-        return pack_keyframes(keyframes, self._window.published.all_poses, frontend, camera, self.hanging.values())
+        return pack_keyframes(
+            keyframes, published_state(self._window).all_poses, frontend, camera, self.hanging.values()
+        )
 
     def _remember(self, keyframes: list[Keyframe], spare: KnownKeyframe | None = None) -> None:
         """Takes keyframes of the window's past, and hangs superfluous ones at others, but not the one to spare."""

@@ -10,6 +10,7 @@ from sigmaslam.estimation.calibration_errors import measured_errors
 from sigmaslam.estimation.gaussian import project_covariance
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.marginalised_poses import PastPoses, past_slice, point_lever
+from sigmaslam.estimation.published_state import published_state
 from sigmaslam.estimation.state_layout import CALIBRATION, LANDMARK_SIZE, MODELLED, pose_slice
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
@@ -123,7 +124,7 @@ def _triangulate(
     window: KeyframeWindow, chosen: np.ndarray, keyframe_times: np.ndarray, min_views: int, absolute: bool
 ) -> PointMap:
     """Points in the world; their covariances with that of the anchor's pose, or given it."""
-    landmarks, state = window.landmarks, window.published
+    landmarks, state = window.landmarks, published_state(window)
     uvd = window.as_calibrated(landmarks.estimate)
     kept = chosen & (landmarks.views >= min_views) & (uvd[:, 2] > _MIN_DISPARITY)
     uvd, landmarks = uvd[kept], landmarks.select(kept)

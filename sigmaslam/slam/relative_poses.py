@@ -14,6 +14,7 @@ import numpy as np
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.published_state import considered_growth, published_state
 from sigmaslam.estimation.relative_covariance import frame_relative_to, last_relative_to
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
 from sigmaslam.slam.keyframes import Keyframes
@@ -76,7 +77,7 @@ class RelativePoseReporter:
             timestamp: of the frame, seconds.
             fit: its fit to the window; None: the last keyframe moved on, be it the frame itself or a prediction.
         """
-        state = self._window.published
+        state = published_state(self._window)
         if not len(state):
             return RelativePoses.empty()
         self._note_keyframes()
@@ -91,7 +92,7 @@ class RelativePoseReporter:
             earlier, covariance = last_relative_to(state, index)
             covariance = covariance + prediction.covariance
         else:
-            joint = replace(fit.joint, common=fit.joint.common * self._window.considered_growth)
+            joint = replace(fit.joint, common=fit.joint.common * considered_growth(self._window))
             earlier, covariance = frame_relative_to(state, joint, index)
             # What the fit was inflated by is the frame's alone.
             covariance = covariance + (fit.covariance - fit.joint.covariance[-6:, -6:])

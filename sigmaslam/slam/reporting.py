@@ -10,6 +10,7 @@ from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.published_state import considered_growth, published_state
 from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.slam.doubt import Doubts
@@ -51,14 +52,14 @@ class Reporter:
         doubts: Doubts,
     ) -> Estimate:
         """What is known after a frame; without a fit by the prediction, without a keyframe nothing."""
-        state = self.window.published
+        state = published_state(self.window)
         if not len(state):
             return self._report_nothing(timestamp, status, milliseconds)
         if fit is not None:
             # Published alone: a prediction as wide as that would find nothing.
             fit = fit.spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            by_error, offset = fit.joint.common[-6:] * self.window.considered_growth, float(fit.calibration[0])
+            by_error, offset = fit.joint.common[-6:] * considered_growth(self.window), float(fit.calibration[0])
             covariance, part = fit.joint.covariance, slice(-6, None)
         else:
             prediction = Prediction.of(self.window, self.motion)
@@ -119,11 +120,11 @@ class Reporter:
 
     def _describe_calibration(self, fit: FrameFit | None) -> CalibrationEstimate:
         """As the last keyframe has it, as a frame's own is forgotten; before the second one as the frame has it."""
-        state = self.window.published
+        state = published_state(self.window)
         errors, covariance, common = state.calibration, state.covariance, state.common
         if fit is not None and self.window.held_offset.value is None:
             errors, covariance = fit.calibration, fit.joint.covariance
-            common = fit.joint.common * self.window.considered_growth
+            common = fit.joint.common * considered_growth(self.window)
         common = common[CALIBRATION]
         sigma = np.sqrt(np.maximum(np.diag(covariance[CALIBRATION, CALIBRATION] + common @ common.T), 0.0))
         chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]

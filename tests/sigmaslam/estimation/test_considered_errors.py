@@ -18,6 +18,7 @@ from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, Calibration
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
+from sigmaslam.estimation.published_state import published_state
 from sigmaslam.estimation.relative_covariance import frame_relative_to, last_relative_to
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
@@ -310,10 +311,10 @@ def test_what_is_published_of_a_bad_calibration_is_as_if_its_sigmas_had_been_lar
     given, larger = (moving_on(GIVEN, sigma).window for sigma in (SIGMA, growth * SIGMA))
     given.worse, larger.worse = 3.0, 1.0
     for found, wanted in (
-        (given.published.whole_covariance, larger.posterior.whole_covariance),
-        (given.published.past.whole_covariance, larger.posterior.past.whole_covariance),
+        (published_state(given).whole_covariance, larger.posterior.whole_covariance),
+        (published_state(given).past.whole_covariance, larger.posterior.past.whole_covariance),
     ):
         scale = np.sqrt(np.diag(wanted))
         np.testing.assert_allclose(found / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=1e-4)
-    assert np.array_equal(given.published.poses, given.posterior.poses)
-    assert np.trace(given.published.whole_covariance) > 1.5 * np.trace(given.posterior.whole_covariance)
+    assert np.array_equal(published_state(given).poses, given.posterior.poses)
+    assert np.trace(published_state(given).whole_covariance) > 1.5 * np.trace(given.posterior.whole_covariance)
