@@ -36,5 +36,7 @@ CHI_SQUARE_999 = np.array(
         22.457744484825323,
     ]
 )
+# 99 % with 6 degrees of freedom.
+CHI_SQUARE_99_OF_6 = 16.811893829770927
 # 99.99 % with 6 degrees of freedom.
 CHI_SQUARE_9999_OF_6 = 27.85634123601417

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
-from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
+from sigmaslam.estimation.chi_square import CHI_SQUARE_99_OF_6, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.geometry.image_cells import explained_area, image_cells
@@ -124,7 +124,7 @@ def find_scene_behind(
         near = disparity > least
         drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
         pull = fit.scores[drawn].sum(axis=0)
-        if pull @ np.linalg.lstsq(rest.T @ rest, pull, rcond=1e-14)[0] < CHI_SQUARE_9999_OF_6:
+        if pull @ np.linalg.lstsq(rest.T @ rest, pull, rcond=1e-14)[0] < CHI_SQUARE_99_OF_6:
             continue
         others = replace(matches, views=views.select(~near), probability=matches.probability[~near])
         far = localiser.fit_near(others, prediction)
