@@ -78,8 +78,8 @@ def make_folder(path: Path) -> None:
         raise InputError(f"{path} cannot be made a folder ({error.strerror or error}): choose another") from error
 
 
-def check_new_folder(path: Path) -> None:
-    """Nothing that is there is written over.
+def check_new_folder(path: Path, option: str = "--out") -> None:
+    """Nothing that is there is written over; `option` of the command line names it.
 
     Raises:
         InputError: `path` is a file, a folder that holds something, a link to nothing, or no possible name.
@@ -88,11 +88,11 @@ def check_new_folder(path: Path) -> None:
         holds_something = path.exists() and (not path.is_dir() or any(path.iterdir()))
     except (OSError, ValueError) as error:  # a name that is too long, a folder that may not be read
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be a new folder ({reason}): choose another --out") from None
+        raise InputError(f"{path}: cannot be a new folder ({reason}): choose another {option}") from None
     if path.is_symlink() and not path.exists():
-        raise InputError(f"{path}: is a link to {path.readlink()}, which is not there: choose another --out")
+        raise InputError(f"{path}: is a link to {path.readlink()}, which is not there: choose another {option}")
     if holds_something:
-        raise InputError(f"{path} exists and is not an empty folder: choose another --out, or remove it")
+        raise InputError(f"{path} exists and is not an empty folder: choose another {option}, or remove it")
 
 
 def atomic_write_text(path: str | Path, text: str) -> None:

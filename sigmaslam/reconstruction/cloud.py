@@ -43,11 +43,6 @@ class DenseCloud(Table):
     intensity: np.ndarray
     views: np.ndarray
 
-    @classmethod
-    def empty(cls) -> DenseCloud:
-        """No point."""
-        return cls(np.zeros((0, 3)), np.zeros((0, 6), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32))
-
     @property
     def sigma(self) -> np.ndarray:
         """(N,) root of the largest eigenvalue of the covariance, metres."""
@@ -101,9 +96,9 @@ class DepthPixels(Table):
     def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> DepthPixels:
         """The chosen pixels, (H, W) bool, of such images (H, W); disparities there are positive."""
         rows = np.flatnonzero(chosen)
-        values = (each.ravel()[rows] for each in (disparity, variance))
         pixels = np.stack(np.divmod(rows, image.shape[1])[::-1], axis=-1)
-        return cls(pixels, *(each.astype(float) for each in values), image.ravel()[rows])
+        values, variances = (each.ravel()[rows].astype(float) for each in (disparity, variance))
+        return cls(pixels, values, variances, image.ravel()[rows])
 
     def points(self, camera: RectifiedStereo) -> np.ndarray:
         """(N, 3) in the rectified left camera, metres."""
@@ -197,13 +192,11 @@ class VoxelCloud:
         keys, sums = self._merged
         seen = sums[:, 10] >= min_views
         keys, sums = keys[seen], sums[seen]
-        if not len(sums):
-            return DenseCloud.empty()
         information, count = sums[:, :6], sums[:, 10]
         covariance = inverse(information)
         points = _times(covariance, sums[:, 6:9])
         finest = np.ones(len(keys), bool)
-        for level in range(1, int(keys[:, 3].max()) + 1):
+        for level in range(1, int(keys[:, 3].max(initial=0)) + 1):
             here = keys[:, 3] == level
             finer = _at_level(points[keys[:, 3] < level], level, self.size)
             finest[here] = ~np.isin(keys[here] @ _ONE_KEY, finer @ _ONE_KEY)

@@ -315,10 +315,10 @@ def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.
     # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
     warped = image.copy()
     warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
-    small = [shrink(each, _FLOW_SCALE) for each in (image, warped)]
+    small, moved = (shrink(each, _FLOW_SCALE) for each in (image, warped))
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     search.setFinestScale(0)
-    flow = cv2.split(search.calc(*small, np.zeros((*small[0].shape, 2), np.float32)))
+    flow = cv2.split(search.calc(small, moved, np.zeros((*small.shape, 2), np.float32)))
     moved_u, moved_v = (_FLOW_SCALE * cv2.resize(each, image.shape[::-1]).ravel()[measured] for each in flow)
     rests = moved_u**2 / (place_u + _FLOW_VARIANCE) + moved_v**2 / (place_v + _FLOW_VARIANCE)
     return np.asarray(alike & (rests <= _GATE_2D))

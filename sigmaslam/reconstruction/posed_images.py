@@ -18,16 +18,6 @@ _MOST_POINTS = 200_000
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def check_export(folder: Path | None) -> None:
-    """Raises InputError where the folder holds something, or cannot be made."""
-    if folder is None:
-        return
-    if not folder.parent.is_dir():
-        raise InputError(f"{folder}: the folder {folder.parent} does not exist: create it, or choose another")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists and is not empty: give a new folder for --export")
-
-
 class PosedImages:
     """Rectified left images of keyframes, written as they come.
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_write_text, check_new_folder
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
@@ -21,7 +21,7 @@ from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, 
 from sigmaslam.reconstruction.depth_fusion import SHARED, DepthView, FusedDepth, fuse_depth
 from sigmaslam.reconstruction.disparity import DisparityMap, Matcher, measure_disparity, semi_global_disparity
 from sigmaslam.reconstruction.mesh import DepthVolume, need_open3d
-from sigmaslam.reconstruction.posed_images import PosedImages, check_export
+from sigmaslam.reconstruction.posed_images import PosedImages
 from sigmaslam.reconstruction.recorded_keyframes import RecordedKeyframes, open_input, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.report.report import write_report
@@ -132,7 +132,8 @@ def reconstruct_run(
         _check_writable(path)
     if mesh is not None:
         need_open3d()
-    check_export(export)
+    if export is not None:
+        check_new_folder(export, "--export")
     keyframes = read_recorded_keyframes(run, every)
     sequence = open_input(keyframes, moved_to)
     match: Matcher = semi_global_disparity if network is None else StereoNetwork(network)

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -69,13 +71,23 @@ def test_a_worse_camera_moves_rows_and_keeps_the_disparities():
 @pytest.mark.long
 def test_the_page_has_every_set_and_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(real_disparity, "real_pairs", lambda data: {"drive": [_pair(20.0, 400.0)]})
-    monkeypatch.setattr(real_disparity, "rendered_pairs", lambda seeds: {"room": [_pair()]})
+
+    def rendered(seeds: tuple[int, ...], worlds: tuple[str, ...] = ("street", "room")) -> dict[str, Any]:
+        return {world: [_pair()] for world in worlds}
+
+    monkeypatch.setattr(real_disparity, "real_pairs", lambda data: {"drive": [_pair(20.0, 400.0)]})
+    monkeypatch.setattr(real_disparity, "rendered_pairs", rendered)
+    # The images are smaller than a tile of the spectrum.
+    monkeypatch.setattr(real_disparity, "_look", lambda name, pairs: [name, str(len(pairs))])
     page = write_real(tmp_path / "page.md", tmp_path, "command")
     assert page.count("| drive | ours |") == 1
     assert page.count("| drive | SGBM") == 2
     with (tmp_path / "page.renders.csv").open() as table:
         renders = [(name, method[:4]) for name, method, *_ in list(csv.reader(table))[1:]]
-    assert renders == [(name, each) for name in ("room", "room, worse camera") for each in ("ours", "SGBM", "SGBM")]
+    names = "street", "room", "street, worse camera", "room, worse camera", "street, detailed"
+    assert renders == [(name, each) for name in names for each in ("ours", "SGBM", "SGBM")]
+    assert "| street, detailed | 1 |" in page
+    assert cv2.imread(str(tmp_path / "page.jpg")).shape[1] == 621
     assert "Ours on the drive, by distance, metres:" in page
     distances = (tmp_path / "page.by-distance.csv").read_text()
     assert "\n10,20," not in distances

@@ -14,6 +14,8 @@ from sigmaslam_synthetic.simulation import Recipe, Studio, simulate
 DRIVE, MIDDLEBURY = "kitti_raw_0926_0039_a", "disparity_middlebury"
 """Folders of the real data."""
 WORLDS = ("street", "room", "organ")
+DETAILED = {"street, detailed": Path(__file__).resolve().parents[3] / "examples" / "detailed_street.py"}
+"""Worlds of the checkout's examples, filmed as streets are."""
 RENDERED_FRAMES = (0, 3)
 """Of each render."""
 # Focal length times baseline of the drive, pixels times metres; its truth's own errors, pixels and share.
@@ -49,12 +51,13 @@ def real_pairs(data: Path) -> dict[str, list[DisparityPair]]:
     return {"drive": _lidar_pairs(data / DRIVE), **_middlebury_pairs(data / MIDDLEBURY)}
 
 
-def rendered_pairs(seeds: tuple[int, ...]) -> dict[str, list[DisparityPair]]:
+def rendered_pairs(seeds: tuple[int, ...], worlds: tuple[str, ...] = WORLDS) -> dict[str, list[DisparityPair]]:
     """Two frames of a render of each world and seed, at the presets' sizes."""
-    pairs: dict[str, list[DisparityPair]] = {world: [] for world in WORLDS}
+    pairs: dict[str, list[DisparityPair]] = {world: [] for world in worlds}
     for world, of_world in pairs.items():
+        preset, file = ("street", str(DETAILED[world])) if world in DETAILED else (world, None)
         for seed in seeds:
-            studio = Studio(simulate(Recipe(world, max(RENDERED_FRAMES) + 1, seed)), device="cpu")
+            studio = Studio(simulate(Recipe(preset, max(RENDERED_FRAMES) + 1, seed, world=file)), device="cpu")
             for frame in studio.frames(np.array(RENDERED_FRAMES)):
                 truth = np.where(frame.stereo_visible & np.isfinite(frame.depth), -frame.stereo[..., 0], np.nan)
                 truth = truth.astype(np.float32)

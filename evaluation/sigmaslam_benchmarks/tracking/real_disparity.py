@@ -12,7 +12,14 @@ import numpy as np
 from sigmaslam.progress import open_progress
 from sigmaslam.reconstruction.disparity import DisparityMap, measure_disparity, semi_global_disparity
 from sigmaslam.table import Table
-from sigmaslam_benchmarks.tracking.disparity_pairs import DisparityPair, real_pairs, rendered_pairs, worse_camera
+from sigmaslam_benchmarks.tracking.disparity_pairs import (
+    DETAILED,
+    DisparityPair,
+    real_pairs,
+    rendered_pairs,
+    worse_camera,
+)
+from sigmaslam_benchmarks.tracking.image_statistics import summarize
 from sigmaslam_benchmarks.tracking.page import fill_page, number, write_page
 
 SWEEP_SEED, SEED = 310, 320
@@ -27,6 +34,9 @@ _SCAN_SHIFTS = np.arange(-0.15, 0.151, 0.01)
 _EDGE_RADIUS, _EDGE_STEP, _EDGE_SHARE = 4, 2.0, 0.1
 _GROSS = 3.0
 """Pixels; the bar of KITTI's stereo benchmark."""
+
+_STREETS = ("street", *DETAILED)
+_PICTURE_WIDTH, _QUALITY = 621, 75
 
 Method = Callable[[np.ndarray, np.ndarray], DisparityMap]
 
@@ -68,6 +78,9 @@ def write_real(path: Path, data: Path, command: str) -> str:
     rng = np.random.default_rng(SEED)
     sets |= rendered
     sets |= {f"{name}, worse camera": [worse_camera(pair, rng) for pair in rendered[name]] for name in rendered}
+    sets |= rendered_pairs((SEED,), tuple(DETAILED))
+    streets = {name: sets[name] for name in (real[0], *_STREETS)}
+    write_streets(path.with_suffix(".jpg"), [pairs[0].left for pairs in streets.values()])
     block, mode = best_setting(rendered_pairs((SWEEP_SEED,)))
     methods: dict[str, Method] = {
         "ours": lambda left, right: measure_disparity(left, right, semi_global_disparity),
@@ -89,6 +102,7 @@ def write_real(path: Path, data: Path, command: str) -> str:
         seed=SEED,
         real=real,
         rows=list(_rows(list(sets), list(methods), judged, seconds)),
+        streets=[_look(name, pairs) for name, pairs in streets.items()],
         split_set=next(iter(sets)),
         splits={
             title: list(_parts(judged[next(iter(sets)), next(iter(methods))], split))
@@ -96,6 +110,22 @@ def write_real(path: Path, data: Path, command: str) -> str:
         },
     )
     return write_page(path, page)
+
+
+def write_streets(path: Path, images: list[np.ndarray]) -> None:
+    """One above the other, of one width."""
+    sizes = [(_PICTURE_WIDTH, round(image.shape[0] * _PICTURE_WIDTH / image.shape[1])) for image in images]
+    small = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each, size in zip(images, sizes, strict=True)]
+    cv2.imwrite(str(path), np.concatenate(small), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+
+
+def _look(name: str, pairs: Sequence[DisparityPair]) -> list[str]:
+    """Median gradient, corners of 3 and 10, noise, and quantiles of the disparities of a set."""
+    found = summarize(name, [pair.left.astype(np.float32) for pair in pairs])
+    truth = np.concatenate([pair.truth[np.isfinite(pair.truth)] for pair in pairs])
+    quantiles = [f"{each:.0f}" for each in np.percentile(truth, (5, 25, 50, 75, 95))]
+    corners = [f"{each:.1f}" for each in found.corner_density]
+    return [name, f"{found.median_gradient:.2f}", *corners, f"{found.median_noise:.2f}", " / ".join(quantiles)]
 
 
 def opencv_matching(left: np.ndarray, right: np.ndarray, block: int, mode: int) -> DisparityMap:

@@ -12,7 +12,8 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, transform_points
 from sigmaslam.reconstruction.cloud import DenseCloud
-from sigmaslam.reconstruction.posed_images import PosedImages, check_export
+from sigmaslam.reconstruction.posed_images import PosedImages
+from sigmaslam.reconstruction.reconstruct import reconstruct_run
 
 CAMERA = RectifiedStereo(50.0, 60.0, 31.0, 23.0, 0.1, 64, 48)
 POSE = se3_exp(np.array([1.0, -2.0, 0.5, 0.3, -0.2, 0.1]))
@@ -68,8 +69,6 @@ def test_nerfstudio_s_transforms_project_the_point_to_its_pixel(written: Path):
     assert (written / content["ply_file_path"]).is_file()
 
 
-def test_a_folder_that_holds_something_is_refused(written: Path):
-    with pytest.raises(InputError, match="not empty"):
-        check_export(written)
-    with pytest.raises(InputError, match="does not exist"):
-        check_export(written / "missing" / "out")
+def test_a_folder_that_holds_something_is_refused_before_anything_is_read(written: Path):
+    with pytest.raises(InputError, match="not an empty folder: choose another --export"):
+        reconstruct_run(written, written / "cloud.ply", export=written)
