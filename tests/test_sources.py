@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from importlib import import_module
 from pathlib import Path
@@ -18,8 +19,7 @@ EQUATIONS, TABLES, FIGURES = 45, 2, 9
 
 
 def rows() -> list[list[str]]:
-    lines = (ROOT / "docs" / "sources.md").read_text().splitlines()
-    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    found = list(csv.reader((ROOT / "docs" / "sources.csv").read_text().splitlines()))
     assert found[0] == ["chapter", "what", "function", "command", "test"]
     return found[1:]
 
