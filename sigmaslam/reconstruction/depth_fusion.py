@@ -332,9 +332,9 @@ def _texture(image: np.ndarray) -> np.ndarray:
 
 def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
     """Bilinear values of images (H, W) or (H, W, C) at N pixels, NaN where one around is; (N,) of each channel."""
-    # OpenCV takes maps of at most 32767 columns.
+    # OpenCV takes maps of at most 32767 columns, and none without a row.
     columns = 1024
-    rows = -(-len(u) // columns)
+    rows = max(-(-len(u) // columns), 1)
     maps = np.full((2, rows * columns), -1e4, np.float32)
     maps[:, : len(u)] = np.where(np.isfinite(u) & np.isfinite(v), [u, v], -1e4)
     map_u, map_v = maps.reshape(2, rows, columns)

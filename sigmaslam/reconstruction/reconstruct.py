@@ -264,10 +264,11 @@ def measure_view(
 
 def default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:
     """A few pixels at the median depth of a keyframe, of two digits, metres."""
-    chosen = depth.is_point if depth.is_point.any() else depth.measured.disparity > 0.0
-    if not chosen.any():
+    single = depth.measured.disparity
+    known = depth.fused.disparity[depth.is_point] if depth.is_point.any() else single[single > 0.0]
+    if not len(known):
         raise InputError("nothing was matched between the eyes in the first keyframe: give --voxel, or check the input")
-    median = camera.focal_baseline / float(np.median(depth.fused.disparity[chosen]))
+    median = camera.focal_baseline / float(np.median(known))
     return float(f"{_VOXEL_PIXELS * median / camera.fx:.2g}")
 
 

@@ -119,6 +119,15 @@ def test_a_pose_that_most_of_the_image_denies_confirms_nothing():
     assert not fused.is_confirmed.any()
 
 
+def test_a_keyframe_without_disparities_has_no_points():
+    image, true = plane(np.eye(4))
+    nothing = DisparityMap(np.full_like(true, np.nan), np.full_like(true, np.nan))
+    view = DepthView.of(image, measure(true, 1))
+    fused = fuse_depth(image, nothing, [(view, np.eye(4), 1e-6 * np.eye(6))], CAMERA)
+    assert np.isnan(fused.disparity).all()
+    assert not fused.is_confirmed.any()
+
+
 def test_pixels_are_measured_alike_whatever_their_number_at_a_time(monkeypatch: pytest.MonkeyPatch):
     image, true = plane(np.eye(4))
     seen, disparity = plane(STEP)

@@ -11,8 +11,12 @@ from onnx import TensorProto, helper
 from scipy.spatial import cKDTree
 
 from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.readers import open_sequence
+from sigmaslam.reconstruction.depth_fusion import FusedDepth
+from sigmaslam.reconstruction.disparity import DisparityMap
 from sigmaslam.reconstruction.live_cloud import CloudSink
+from sigmaslam.reconstruction.reconstruct import KeyframeDepth, default_voxel
 from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.run_record.dense_points import read_dense_points
@@ -83,6 +87,15 @@ def test_a_cloud_made_while_tracking_is_near_that_of_later_and_changes_no_pose(t
     assert np.median(distance / live.sigma) < 0.5
     assert run_here("track", tracked / "input", "--out", tmp_path / "run", "--overwrite").returncode == 0
     assert not (tmp_path / "run" / "cloud.ply").exists()
+
+
+def test_voxels_have_a_size_where_the_first_keyframe_has_no_points():
+    camera = RectifiedStereo(400.0, 400.0, 30.0, 20.0, 0.1, 60, 40)
+    shape, nothing = (40, 60), np.full((40, 60), np.nan, np.float32)
+    single = DisparityMap(np.full(shape, 8.0, np.float32), np.ones(shape, np.float32))
+    fused = FusedDepth(nothing, nothing, *np.zeros((2, *shape), np.uint8))
+    depth = KeyframeDepth(0, np.zeros(shape, np.uint8), single, fused, np.eye(4), np.eye(6), 0.1)
+    assert default_voxel(depth, camera) == pytest.approx(3 * 5.0 / 400.0, rel=0.02)
 
 
 @pytest.mark.long
