@@ -40,6 +40,8 @@ What is the right camera's alone depends on the place in the right image.
 """
 OF_PAIR = ERRORS[:-VIEW_TURNS]
 """What is wrong with the pair; the others are of views."""
+SHOWN = tuple(name for name in OF_PAIR if name not in ("offset", "focal", "baseline"))
+"""What images show of a pair, beside the offset, which is estimated; hardly anything of its scale."""
 TURNS = ("yaw", "pitch", "roll")
 """Of the right camera."""
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, CalibrationPrior
 from sigmaslam.estimation.state_layout import CALIBRATION
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.inference.onnx_graph import Step
@@ -133,7 +133,7 @@ class CalibrationEvidence:
         return {k: Cause(odds / total, *found[k][1:]) for k, odds in weights.items() if odds > _HOPELESS * total}
 
     def worse_by(self, causes: dict[str, Cause]) -> float:
-        """By what factor errors of the pair, but the offset, are larger than usual beside these causes; 1 or more."""
+        """By what factor errors that images show are larger than usual beside these causes; 1 or more."""
         identity, sigma = np.eye(len(ERRORS)), self._sigma
         information = np.linalg.inv(self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(sigma, sigma))
         vector = information @ ((self._posterior.calibration - self.expected) / sigma) / _ALIKE
@@ -143,7 +143,7 @@ class CalibrationEvidence:
             for name, cause in causes.items()
         ]
         beside = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
-        grows = np.isin(ERRORS, OF_PAIR[1:]) & self._is_uncertain
+        grows = np.isin(ERRORS, SHOWN) & self._is_uncertain
         likelihoods = []
         for factor in _WORSE:
             prior = np.diag(np.where(grows, factor**2, 1.0)) + beside

@@ -64,7 +64,7 @@ class KeyframeWindow:
         held_offset: what the disparity offset is taken to be in poses that are published.
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
         exceeded: (15,) bool, estimated errors beyond four standard deviations of their prior.
-        worse: factor by which considered errors of the pair are larger than their standard deviations, 1 or more.
+        worse: factor by which errors that images show are larger than their standard deviations, 1 or more.
     """
 
     def __init__(

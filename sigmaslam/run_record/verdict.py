@@ -120,8 +120,8 @@ def calibration_verdict(
     """
     words = _main_verdict(calibration, frames, points, expected, findings)
     if calibration.worse > 1.0:
-        words += f" Beside this, lenses, turns and focal length seem about {calibration.worse:.1f} times as far off as "
-        words += "the calibration's sigmas say: the covariances hold that."
+        words += f" Lenses and turns, though, seem about {calibration.worse:.1f} times as far off as the "
+        words += "calibration's sigmas say: the covariances hold that."
     return words
 
 

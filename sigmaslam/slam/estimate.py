@@ -24,8 +24,8 @@ class CalibrationEstimate:
             names: value and standard deviation, in the units of `sigmaslam.estimation.calibration_errors.ERRORS`.
         causes: what is wrong by the evidence, by the names of `sigmaslam.estimation.calibration_evidence.HYPOTHESES`:
             its probability, above a half; its error and standard deviation, as shares of the focal length.
-        worse: factor by which errors that are not estimated are larger than the calibration's sigmas say, as far as
-            images show; covariances hold it. 1 where the sigmas suffice.
+        worse: factor by which other errors but the scale's are larger than the calibration's sigmas say, as images
+            show; covariances hold it. 1 where the sigmas suffice.
     """
 
     disparity_offset: float

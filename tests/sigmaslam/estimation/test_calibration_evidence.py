@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from sigmaslam.estimation.calibration_correction import change_rig
-from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, TURNS, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, TURNS, CalibrationPrior
 from sigmaslam.estimation.calibration_evidence import _ALIKE, _WORSE, HYPOTHESES, CalibrationEvidence, Cause
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
@@ -125,7 +125,7 @@ def test_errors_of_a_bad_calibration_are_as_much_larger_as_their_likelihood_says
         slopes = 3.0 * rng.normal(size=(COUNT, len(ERRORS)))
         # What views say counts an eighth, as those of an eighth of their information would.
         loud = np.sqrt(_ALIKE) * NOISE
-        grows = np.isin(ERRORS, OF_PAIR[1:])
+        grows = np.isin(ERRORS, SHOWN)
         measured = slopes @ (rng.normal(size=len(ERRORS)) * USUAL.sigma * np.where(grows, worse, 1.0))
         measured += loud * rng.normal(size=COUNT)
         evidence = CalibrationEvidence(USUAL, CAMERA.fx, load_step("window_condition"))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sigmaslam.estimation.calibration_errors import ERRORS, OF_PAIR, CalibrationPrior
+from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, CalibrationPrior
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
@@ -307,7 +307,7 @@ def without_errors(solution: Solution) -> Solution:
 
 
 def test_what_is_published_of_a_bad_calibration_is_as_if_its_sigmas_had_been_larger():
-    growth = np.where(np.isin(NAMES, OF_PAIR), 3.0, 1.0)
+    growth = np.where(np.isin(NAMES, SHOWN), 3.0, 1.0)
     given, larger = (moving_on(GIVEN, sigma).window for sigma in (SIGMA, growth * SIGMA))
     given.worse, larger.worse = 3.0, 1.0
     for found, wanted in (
