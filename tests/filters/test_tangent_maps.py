@@ -142,6 +142,7 @@ def test_gradients_go_through_derivatives_along_directions():
     assert_close(found, expected, 1e-14)
 
 
+@pytest.mark.long
 def test_a_derivative_of_derivatives_along_broadcast_changes():
     """As in a compiled filter: one point, several changes; torch takes no derivative of what shares memory."""
     maps, point, changes = Differentiated(SO3()), tensor(0.0, 0.0, 0.0, 1.0), random_numbers(3, 4)
