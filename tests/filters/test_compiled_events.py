@@ -191,9 +191,8 @@ class Directions:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [2, 40], ids=["one by one", "as a batch"])
-def test_an_extended_filter_on_a_manifold_of_ones_own_is_compiled(count: int, caplog: pytest.LogCaptureFixture):
-    space = Directions()
+def test_an_extended_filter_on_a_manifold_of_ones_own_is_compiled(caplog: pytest.LogCaptureFixture):
+    space, count = Directions(), 2
     motion = filters.MotionModel(lambda at, step: space.retract(at, step), filters.Diagonal(tensor(1e-4, 1e-4)))
     see = filters.MeasurementModel(lambda at: at[..., :2], filters.Diagonal(tensor(0.01, 0.01)))
     ekf, start = filters.ExtendedKalmanFilter(space), tensor(0.0, 0.0, 1.0).expand(count, 3)

@@ -140,3 +140,12 @@ def test_gradients_go_through_derivatives_along_directions():
     s = scale.detach().requires_grad_()
     (expected,) = torch.autograd.grad((torch.cos(s * x) * s * direction).sum(), s)
     assert_close(found, expected, 1e-14)
+
+
+@pytest.mark.long
+def test_a_derivative_of_derivatives_along_broadcast_changes():
+    """As in a compiled filter: one point, several changes; torch takes no derivative of what shares memory."""
+    maps, point, changes = Differentiated(SO3()), tensor(0.0, 0.0, 0.0, 1.0), random_numbers(3, 4)
+    value, slope = torch.func.jvp(lambda change: maps.push_local(point, change), (changes,), (changes,))
+    # It is linear in the change.
+    assert_close(slope, value, 1e-12)
