@@ -28,7 +28,9 @@ def read_card(card: Path) -> dict[str, Any]:
         InputError: the file is missing or says too little.
     """
     if not card.is_file():
-        raise InputError(f"{card} does not exist: weights ship only with the card of the run that made them")
+        raise InputError(
+            f"{card} does not exist: weights ship only with the card that a training writes at its end (--resume)"
+        )
     try:
         content: Any = json.loads(read_text(card, _CARD_BYTES, "the card"))
     except (ValueError, RecursionError) as error:
