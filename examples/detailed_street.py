@@ -2,11 +2,16 @@
 
 It is the street of the preset with poles and wires along one side, fences of bars, trees of single leaves, and cars
 with round bodies, glass and shining paint.
+
+    python examples/detailed_street.py street.png  # a picture of it
+    sigmaslam train render street --out DIR --world examples/detailed_street.py
 """
 
+import sys
 from itertools import pairwise
 from unittest.mock import patch
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +19,7 @@ from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.motion.random_motions import CAMERA_HEIGHT
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam_synthetic.scene import Body, Material, Scene, Texture
+from sigmaslam_synthetic.simulation import Recipe, Studio, simulate
 from sigmaslam_synthetic.worlds import street, street_layout, street_traffic
 from sigmaslam_synthetic.worlds.episode import Episode, Wish
 from sigmaslam_synthetic.worlds.palette import Palette
@@ -136,3 +142,12 @@ def _shining(palette: Palette, chosen: int) -> int:
     layers = tuple(Texture(each.kind, each.seed, each.tile, 0.5 * each.contrast) for each in material.layers)
     palette.materials.append(Material(material.brightness, layers, 1.0, 120.0))
     return len(palette.materials) - 1
+
+
+def run(seed: int = 0) -> np.ndarray:
+    """The first left image of the street of a seed, (H, W) uint8."""
+    return Studio(simulate(Recipe("street", 1, seed, world=__file__))).frames(np.array([0]))[0].left
+
+
+if __name__ == "__main__":
+    cv2.imwrite(sys.argv[1], run())

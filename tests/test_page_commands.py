@@ -23,7 +23,7 @@ EAGER = {"--help", "--install-completion", "--show-completion", "--version"}
 # Typer may bring its own click; this is a public name of it.
 UsageError = typer.BadParameter.__base__
 # Options of other programs that pages name.
-FOREIGN = {"--ages", "--index-url", "--many-linux", "--nproc-per-node", "--part"}
+FOREIGN = {"--ages", "--index-url", "--many-linux", "--nproc-per-node", "--part", "--truth-sigmas"}
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 PROGRAM = "sigmaslam "
 

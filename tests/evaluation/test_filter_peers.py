@@ -63,7 +63,9 @@ def test_peer_equals_numpy_reference(peer: Peer, work: Work, dtype: str) -> None
 def step_stereo_dense(work: filter_work.StereoWork) -> filter_work.Belief:
     """One step with the textbook update: S = Z Z^T + R of size 4m is formed and solved."""
     return filter_work._update(
-        *filter_work._predict_stereo(work),
+        *filter_work._predict(
+            work.mean, work.covariance, lambda states: filter_work.advance(states, work.transition), work.process_noise
+        ),
         lambda states: filter_work.project_stereo(np, states, work.points),
         work.measurement_noise,
         work.measurement,

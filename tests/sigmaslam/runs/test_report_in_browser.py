@@ -104,7 +104,7 @@ def test_the_path_tells_its_sigma_under_the_mouse_and_shows_its_frame_on_a_click
     # Where the pose of row 120 is on the screen.
     x, y = page.evaluate(
         """() => { const { scene, page } = report, p = scene.camera.position.clone();
-        p.fromArray(page.scene.path, 3 * 120).project(scene.camera);
+        p.fromArray(page.scenes[0].path, 3 * 120).project(scene.camera);
         const box = document.getElementById("scene");
         return [(p.x + 1) / 2 * box.clientWidth, (1 - p.y) / 2 * box.clientHeight]; }"""
     )
@@ -170,7 +170,7 @@ def test_a_browser_without_webgl_shows_the_rest(browser: Any, report: Path):
 def test_one_time_line_moves_marker_picture_and_plots_and_plays(page: Any):
     slider, text = page.locator("#time"), page.locator("#time-text")
     slider.fill("30")
-    seconds = page.evaluate("report.page.scene.path_seconds[30]")
+    seconds = page.evaluate("report.page.scenes[0].path_seconds[30]")
     assert text.text_content().startswith(f"{seconds:.2f} s")
     assert float(page.locator("#frame-text").text_content().split(" s,")[0]) == pytest.approx(seconds, abs=0.5)
     cursor = page.evaluate("report.plots[0].posToVal(report.plots[0].cursor.left, 'x')")
