@@ -113,14 +113,11 @@ class CalibrationEvidence:
 
     def weigh(self) -> dict[str, Cause]:
         """What may be wrong, by its name, unless it is hopeless; "nothing" has the rest of the probability."""
-        # In units of the usual standard deviations, in which S is the identity.
         usual, sigma = np.eye(len(ERRORS)), self._sigma
-        mean = (self._posterior.calibration - self.expected) / sigma
-        covariance = self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(sigma, sigma)
-        precision = np.linalg.inv(covariance)
+        mean, covariance, precision = self._in_usual_sigmas()
         found: dict[str, tuple[float, float, float]] = {}
-        for name, moved in HYPOTHESES.items():
-            spread = self._size * np.isin(ERRORS, moved) / sigma
+        for name in HYPOTHESES:
+            spread = self._spread(name)
             growth = 1.0 + spread @ (usual - covariance) @ spread
             ratio = 0.5 * ((spread @ mean) ** 2 / growth - np.log(growth))
             k, own = ERRORS.index(name), np.linalg.inv(usual + np.outer(spread, spread))
@@ -134,14 +131,10 @@ class CalibrationEvidence:
 
     def worse_by(self, causes: dict[str, Cause]) -> float:
         """By what factor errors that images show are larger than usual beside these causes; 1 or more."""
-        identity, sigma = np.eye(len(ERRORS)), self._sigma
-        information = np.linalg.inv(self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(sigma, sigma))
-        vector = information @ ((self._posterior.calibration - self.expected) / sigma) / _ALIKE
-        information = (information - identity) / _ALIKE
-        spreads = [
-            np.sqrt(cause.probability) * self._size * np.isin(ERRORS, HYPOTHESES[name]) / sigma
-            for name, cause in causes.items()
-        ]
+        identity = np.eye(len(ERRORS))
+        mean, _, precision = self._in_usual_sigmas()
+        vector, information = precision @ mean / _ALIKE, (precision - identity) / _ALIKE
+        spreads = [np.sqrt(cause.probability) * self._spread(name) for name, cause in causes.items()]
         beside = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
         grows = np.isin(ERRORS, SHOWN) & self._is_uncertain
         likelihoods = []
@@ -151,3 +144,12 @@ class CalibrationEvidence:
             squared = vector @ np.linalg.solve(seen, prior @ vector)
             likelihoods.append(squared - np.linalg.slogdet(seen)[1])
         return float(_WORSE[int(np.argmax(likelihoods))])
+
+    def _in_usual_sigmas(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean (15,), covariance and precision (15, 15) of the errors in the usual sigmas: S is the identity there."""
+        covariance = self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(self._sigma, self._sigma)
+        return (self._posterior.calibration - self.expected) / self._sigma, covariance, np.linalg.inv(covariance)
+
+    def _spread(self, name: str) -> np.ndarray:
+        """(15,) standard deviation times direction of a hypothesis, in the usual sigmas: s w."""
+        return np.asarray(self._size * np.isin(ERRORS, HYPOTHESES[name]) / self._sigma)

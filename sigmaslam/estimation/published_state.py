@@ -14,6 +14,8 @@ from sigmaslam.estimation.window_state import WindowState, scale_considered
 
 def published_state(window: KeyframeWindow) -> WindowState:
     """The posterior with these errors."""
+    if window.worse == 1.0:
+        return window.posterior
     return scale_considered(window.posterior, considered_growth(window))
 
 
