@@ -121,8 +121,8 @@ class FrameClock:
 
 
 def _first_noise(steps: np.ndarray) -> float:
-    """Of too few intervals for a moment: bursts show at once."""
-    if len(steps) < 2 or steps.mean() > _SLOWEST or steps.max() <= _MOST_DROPPED * steps.min():
+    """Of too few intervals for a moment: those that differ, but not by whole frames, show at once."""
+    if len(steps) < 2 or steps.mean() > _SLOWEST or np.ptp(steps) <= _BELIEVED * steps.mean() or _are_multiples(steps):
         return 0.0
     return float(steps.std())
 

@@ -10,6 +10,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.chi_square import CHI_SQUARE_99_OF_6, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.prediction_errors import surprise
 from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
@@ -118,6 +119,11 @@ def find_scene_behind(
     """
     window, views = localiser.window, matches.views
     rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
+    # Far parts would side with a prediction that the image contradicts, and near ones seem to move.
+    excess = surprise(localiser.motion, se3_inverse(window.posterior.poses[-1]) @ fit.pose)
+    if excess > 1.0:
+        prediction = Prediction(prediction.pose, excess * prediction.covariance)
+        fit = localiser.fit_again(matches, fit, prediction)
     disparity = window.landmarks.estimate[rows, 2]
     drawn_by, most = np.zeros(6), 0.0
     for least in np.quantile(disparity[fit.inliers], _FARTHER):

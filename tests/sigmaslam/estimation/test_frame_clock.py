@@ -81,6 +81,18 @@ def test_frames_of_bursts_are_known_to_be_regular_once_some_were_seen(size: int)
     assert (found[:, 1] < 0.05).all()
 
 
+@pytest.mark.parametrize(("second", "is_noise"), [(0.14, True), (0.09, True), (0.062, False), (0.12, False), (0.18, False)])
+def test_two_intervals_that_differ_but_not_by_whole_frames_are_not_believed(second: float, is_noise: bool):
+    """A velocity learned by the first one would be wrong by half."""
+    clock = FrameClock()
+    assert clock.tick(0.06) == (0.06, 0.0, 1.0)
+    seconds, sigma, stretch = clock.tick(second)
+    assert (sigma > 0.0) == is_noise
+    if is_noise:
+        assert abs(seconds - 0.5 * (0.06 + second)) < sigma
+        assert stretch == pytest.approx(0.5 * (0.06 + second) / 0.06)
+
+
 def test_what_was_learned_by_intervals_within_a_burst_is_made_good():
     clock = FrameClock()
     stretches = [clock.tick(step)[2] for step in [0.004, 0.004, 0.004, 0.006, 0.5, 0.004, 0.004]]
