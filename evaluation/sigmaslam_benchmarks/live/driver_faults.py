@@ -145,6 +145,14 @@ def drop_in_a_row(count: int, frames: Frames, rng: np.random.Generator) -> Frame
     return frames[:first] + frames[first + count :]
 
 
+def drop_uncounted(share: float, frames: Frames, rng: np.random.Generator) -> Frames:
+    """Frames that are missing at random, and the third of all, under stamps of a counter that has not counted them."""
+    kept = rng.random(len(frames)) >= share
+    kept[:4] = True, True, False, True
+    left = [frame for frame, keep in zip(frames, kept, strict=True) if keep]
+    return [replace(each, timestamp=as_if.timestamp) for each, as_if in zip(left, frames, strict=False)]
+
+
 def repeat_out_of_order(frames: Frames, rng: np.random.Generator) -> Frames:
     """An old pair under a new stamp, once in ten frames: a ring of buffers that is read too late."""
     shown = np.arange(len(frames))
@@ -330,6 +338,7 @@ FAULTS: dict[str, Fault] = {
     "frozen_10": Fault("the same pair for 10 frames", partial(freeze, 10)),
     "frozen_right": Fault("the same right image for 5 frames", partial(freeze_right, 5)),
     "drop_20": Fault("a fifth of the frames is missing", partial(drop, 0.2)),
+    "uncounted": Fault("a tenth is missing, stamps are of a counter without them", partial(drop_uncounted, 0.1)),
     "gap_10": Fault("10 frames in a row are missing", partial(drop_in_a_row, 10)),
     "repeated": Fault("an old pair under a new stamp, once in ten", repeat_out_of_order),
     "out_of_order": Fault("two pairs exchanged, stamps in order, once in ten", swap_neighbours),

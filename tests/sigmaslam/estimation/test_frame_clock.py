@@ -81,7 +81,9 @@ def test_frames_of_bursts_are_known_to_be_regular_once_some_were_seen(size: int)
     assert (found[:, 1] < 0.05).all()
 
 
-@pytest.mark.parametrize(("second", "is_noise"), [(0.14, True), (0.09, True), (0.062, False), (0.12, False), (0.18, False)])
+@pytest.mark.parametrize(
+    ("second", "is_noise"), [(0.14, True), (0.09, True), (0.062, False), (0.12, False), (0.18, False)]
+)
 def test_two_intervals_that_differ_but_not_by_whole_frames_are_not_believed(second: float, is_noise: bool):
     """A velocity learned by the first one would be wrong by half."""
     clock = FrameClock()
