@@ -176,11 +176,6 @@ class Localiser:
             return other.nis_per_dof < fit.nis_per_dof
         return other.nis_per_dof <= ACCEPTANCE.doubtful_nis and other.count > fit.count
 
-    def _gives_way(self, fit: FrameFit, alone: FrameFit) -> bool:
-        """Whether the prediction's pose of some matches gives way to their own: it loses half, or spoils the fit."""
-        is_spoilt = fit.nis_per_dof > ACCEPTANCE.doubtful_nis >= alone.nis_per_dof
-        return is_spoilt or fit.count < ACCEPTANCE.guided_share * alone.count
-
     def fit_again(self, matches: GuidedMatches, fit: FrameFit, prediction: Prediction) -> FrameFit:
         """The pose of the same matches by a prediction that has become less certain; `fit` where there is none."""
         pose, covariance = prediction.pose, prediction.covariance
@@ -231,7 +226,7 @@ class Localiser:
             clock.lap("filter")
             if back == 1 and prediction.excludes(start):
                 alone = self._fit_alone(matches, near, prediction, start, relative.scale)
-                if alone is not None and (fit is None or self._gives_way(fit, alone)):
+                if alone is not None and (fit is None or _gives_way(fit, alone)):
                     fit = alone
                 clock.lap("filter")
             enough = fit is not None and fit.count >= ACCEPTANCE.unguided_share * len(matches.probability)
@@ -257,3 +252,9 @@ class Localiser:
     def _explained_area(self, matches: GuidedMatches, fit: FrameFit) -> float:
         camera, places = self.window.camera, matches.views.measurement[:, :2]
         return explained_area(image_cells(places, camera.width, camera.height), fit.inliers, np.ones(len(places)))
+
+
+def _gives_way(fit: FrameFit, alone: FrameFit) -> bool:
+    """Whether the prediction's pose loses half of the landmarks that agree alone, or fits them badly."""
+    fits_badly = fit.nis_per_dof > ACCEPTANCE.doubtful_nis >= alone.nis_per_dof
+    return fits_badly or fit.count < ACCEPTANCE.guided_share * alone.count
