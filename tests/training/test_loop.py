@@ -110,6 +110,7 @@ def test_run_folder_holds_weights_card_log_curves_and_samples(finished, tiny):
     assert [image.step for image in events.Images("matches")] == [0, 4]
 
 
+@pytest.mark.long
 def test_a_trial_is_validated_on_a_tenth_of_what_it_learns_from(tiny, tmp_path, monkeypatch, capsys):
     counts = []
     monkeypatch.setattr(loop, "matching_accuracy", lambda network, seed, sources, count: counts.append(count) or {})
