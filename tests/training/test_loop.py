@@ -16,6 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sigmaslam.errors import InputError
 from sigmaslam_models.network_export import load_network
 from sigmaslam_training import devices
+from sigmaslam_training.features import loop
 from sigmaslam_training.features.checkpoint import CHECKPOINT_NAME
 from sigmaslam_training.features.loop import WEIGHTS_NAME, train
 from sigmaslam_training.features.recipes import TrainingConfig
@@ -107,6 +108,16 @@ def test_run_folder_holds_weights_card_log_curves_and_samples(finished, tiny):
     assert scalars >= {f"train/{name}" for name in ("descriptor", "quality", "place", "recall", "learning_rate")}
     assert scalars >= {"train/steps_per_second", "held_out/mma_3"}
     assert [image.step for image in events.Images("matches")] == [0, 4]
+
+
+@pytest.mark.long
+def test_a_trial_is_validated_on_a_tenth_of_what_it_learns_from(tiny, tmp_path, monkeypatch, capsys):
+    counts = []
+    monkeypatch.setattr(loop, "matching_accuracy", lambda network, seed, sources, count: counts.append(count) or {})
+    monkeypatch.setattr(loop, "draw_sample", lambda network, pair: np.zeros((2, 2, 3), np.uint8))
+    train(tmp_path, replace(tiny, steps=5, batch_size=2), workers=0)
+    assert counts == [2]
+    assert "step 5: matching 2 held-out pairs" in capsys.readouterr().err
 
 
 def test_a_log_that_a_power_cut_tore_is_gone_on_with(finished, tmp_path):

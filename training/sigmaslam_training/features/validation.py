@@ -12,7 +12,7 @@ from sigmaslam_models.feature_network import FeatureNetwork
 from sigmaslam_training.features.stream import Pair, open_stream
 from sigmaslam_training.sources import Mix, label, turns_of
 
-_PAIRS = 48
+PAIRS = 48
 _KEYPOINTS = 256
 _SEED_OFFSET = 1_000_003
 _SOURCES = ("leaves", "patterns", "scenes")
@@ -59,7 +59,7 @@ def held_out_sources(mix: Mix) -> tuple[str, ...]:
 
 @torch.no_grad()
 def matching_accuracy(
-    network: FeatureNetwork, seed: int, sources: Sequence[str] = _SOURCES, pairs: int = _PAIRS, size: int = 224
+    network: FeatureNetwork, seed: int, sources: Sequence[str] = _SOURCES, pairs: int = PAIRS, size: int = 224
 ) -> dict[str, float]:
     """Mutual nearest neighbours on pairs of the sources in turn, whatever the network learned from.
 
