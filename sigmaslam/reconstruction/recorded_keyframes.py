@@ -107,7 +107,7 @@ class RecordedKeyframes:
             InputError: the sequence lacks one of them.
         """
         wanted = 0
-        with closing(sequence.frames()) as frames:
+        with closing(sequence.at(self.timestamps - _SAME_TIME).frames()) as frames:
             for frame in frames:
                 if frame.timestamp > self.timestamps[wanted] + _SAME_TIME:
                     break
