@@ -48,7 +48,8 @@ _MOST_ROWS, _ROW_WINDOW = np.float32(1.0), (15, 15)
 # confirmation, one of the second is none, pixels.
 _SAME_AT_HALF, _SURE, _UNSURE = 2.0, 0.5, 2.0
 # The variance of a disparity is a sum of what it depends on: a floor, pixels squared, and factors of the Cramer-Rao
-# bound, the relief and the edge of `Alignment`. Fitted on renders of room, street and organ with seeds below 1000 by
+# bound, of the variance of the disparities in the window about a smooth surface (relief), and of the squared distance
+# from their mean (edge). Fitted on renders of room, street and organ with seeds below 1000 by
 # the likelihood of Student's t distribution with five degrees of freedom, then all times 2.35, which brings 95.4 % of
 # their pixels inside two sigma. The renders are as unlike eyes see them: exposure, gain, gamma, vignetting, blur and
 # noise differ, and rows are off by 0.15 pixels.
@@ -73,25 +74,6 @@ class DisparityMap:
     variance: np.ndarray
 
 
-@dataclass(frozen=True, slots=True)
-class Alignment:
-    """What the alignment of a disparity map found.
-
-    Attributes:
-        disparity: (H, W) float32 pixels, NaN where there was none.
-        bound: (H, W) Cramer-Rao bound of its variance for independent noise in the window, pixels squared.
-        relief: (H, W) variance of the disparities in the window about the smoothed ones, pixels squared.
-        edge: (H, W) squared difference of the disparity and the mean of the window, pixels squared.
-        row_variance: mean square of the row offsets, pixels squared.
-    """
-
-    disparity: np.ndarray
-    bound: np.ndarray
-    relief: np.ndarray
-    edge: np.ndarray
-    row_variance: float
-
-
 def measure_disparity(left: np.ndarray, right: np.ndarray, match: Matcher) -> DisparityMap:
     """Disparities with their variances.
 
@@ -104,14 +86,10 @@ def measure_disparity(left: np.ndarray, right: np.ndarray, match: Matcher) -> Di
     """
     matched = match(left, right)
     aligned = align_disparity(left, right, matched)
-    # Rectification leaves as much along the rows as across them, where it can be seen.
-    floor = _FLOOR + aligned.row_variance
-    variance = floor + _BY_BOUND * aligned.bound + _BY_RELIEF * aligned.relief + _BY_EDGE * aligned.edge
     with np.errstate(invalid="ignore"):
         confirmed = np.abs(_half_size_disparity(left, right, matched) - matched) <= _SAME_AT_HALF
-    stays = (confirmed | (variance < _SURE**2)) & (variance < _UNSURE**2) & np.isfinite(matched)
-    disparity, variance = (np.where(stays, each, np.float32(np.nan)) for each in (aligned.disparity, variance))
-    return DisparityMap(disparity, variance.astype(np.float32))
+    stays = (confirmed | (aligned.variance < _SURE**2)) & (aligned.variance < _UNSURE**2) & np.isfinite(matched)
+    return DisparityMap(*(np.where(stays, each, np.float32(np.nan)) for each in (aligned.disparity, aligned.variance)))
 
 
 def semi_global_disparity(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -185,7 +163,7 @@ def _semi_global(left: np.ndarray, right: np.ndarray, largest: float, speckle: f
     return np.where((disparity >= _LEAST) & inside, disparity, np.float32(np.nan))
 
 
-def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> Alignment:
+def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> DisparityMap:
     """Aligns the images by Gauss-Newton steps of every pixel's disparity, each the mode of its posterior.
 
     The prior of a step is the smoothed map. Brightness may differ between the eyes by a gain and an offset, rows by a
@@ -241,13 +219,10 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     inverse = np.float32(1.0) / np.maximum(window_mean(known.astype(np.float32)), np.float32(1e-3))
     aligned = np.where(known, found, np.float32(0.0))
     edge = np.minimum(np.abs(aligned - mean(aligned)), _WIDEST_EDGE) ** 2
-    return Alignment(
-        np.where(known, aligned, np.float32(np.nan)),
-        bound,
-        mean(relief),
-        edge.astype(np.float32),
-        float(np.mean(offset**2)),
-    )
+    # Rectification leaves as much along the rows as across them, where it can be seen.
+    variance = np.float32(_FLOOR + float(np.mean(offset**2))) + _BY_BOUND * bound + _BY_RELIEF * mean(relief)
+    variance += _BY_EDGE * edge
+    return DisparityMap(np.where(known, aligned, np.float32(np.nan)), variance)
 
 
 def row_offset(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> np.ndarray:
