@@ -44,8 +44,12 @@ def reconstruct(
     Depths of each keyframe are fused with those of the keyframes around it; what these do not confirm, and what moves,
     is left out. The cloud is in the report of the run, too.
     """
+    import cv2
+
     from sigmaslam.reconstruction.reconstruct import reconstruct_run
 
+    # Views are measured in one thread and fused in another: more would wait for each other.
+    cv2.setNumThreads(1)
     summary = reconstruct_run(run, out, mesh, input, network, voxel, max_sigma, min_views, every, export)
     typer.echo(
         f"{summary.points} points of {summary.keyframes} keyframes in {out}, voxels of {summary.voxel:g} m and more, "

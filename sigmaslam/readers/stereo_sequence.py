@@ -5,6 +5,7 @@ import queue
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
+from copy import copy
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -119,6 +120,15 @@ class StereoSequence:
         """
         pairs = select_pairs(self._pairs, selection, self.source)
         return StereoSequence(pairs, self._stored, self.source, self.format, scale)
+
+    def at(self, times: np.ndarray) -> "StereoSequence":
+        """The first pairs from each of these times on, seconds; all pairs where they must be read in order."""
+        some, pairs, stamps = copy(self), self._pairs, self.timestamps or []
+        rows = np.unique(np.searchsorted(stamps, times))
+        if isinstance(pairs, ImagePairs) and rows[-1] < len(stamps):
+            some.timestamps, some.length = [stamps[row] for row in rows], len(rows)
+            some._pairs = ImagePairs([pairs.files[row] for row in rows], some.timestamps, Path(pairs.source))
+        return some
 
     def use_masks(self, path: Path) -> None:
         """Takes a mask of the left images as they are stored, or a folder with one for each; see `Masks`.

@@ -95,10 +95,8 @@ class DepthPixels(Table):
     @classmethod
     def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> DepthPixels:
         """The chosen pixels, (H, W) bool, of such images (H, W); disparities there are positive."""
-        rows = np.flatnonzero(chosen)
-        pixels = np.stack(np.divmod(rows, image.shape[1])[::-1], axis=-1)
-        values, variances = (each.ravel()[rows].astype(float) for each in (disparity, variance))
-        return cls(pixels, values, variances, image.ravel()[rows])
+        values, variances = (each[chosen].astype(float) for each in (disparity, variance))
+        return cls(np.argwhere(chosen)[:, ::-1], values, variances, image[chosen])
 
     def points(self, camera: RectifiedStereo) -> np.ndarray:
         """(N, 3) in the rectified left camera, metres."""
@@ -133,10 +131,10 @@ class DepthPixels(Table):
     def thinned(self, camera: RectifiedStereo, size: float) -> DepthPixels:
         """The most certain pixel of each voxel of the camera's frame; those beside it have nearly the same errors."""
         points = self.points(camera)
-        sigma = np.linalg.norm(points, axis=1) * np.sqrt(self.variance) / self.disparity
-        keys = _voxels(points, sigma, size) @ _ONE_KEY
-        order, first = _groups(keys)
-        relative = (self.variance / self.disparity**2)[order]
+        relative = self.variance / self.disparity**2
+        sigma = np.sqrt(np.einsum("ni,ni->n", points, points) * relative)
+        order, first = _groups(_voxels(points, sigma, size) @ _ONE_KEY)
+        relative = relative[order]
         count = np.diff(np.r_[first, len(order)])
         best = relative == np.repeat(np.minimum.reduceat(relative, first), count)
         return self.select(np.minimum.reduceat(np.where(best, order, len(order)), first))
@@ -174,8 +172,8 @@ class VoxelCloud:
         weighted = _times(information, cloud.points)
         sums = np.column_stack([information, weighted, cloud.intensity * cloud.views, cloud.views])
         self._pending.append((_voxels(cloud.points, cloud.sigma, self.size), sums))
-        # Amortised: each point is sorted about as many times as the cloud doubles.
-        if sum(len(part[0]) for part in self._pending) > len(self._merged[0]):
+        # Amortised: each point is sorted about as many times as the cloud triples.
+        if sum(len(part[0]) for part in self._pending) > min(2 * len(self._merged[0]), self._most):
             self._merge()
             if len(self._merged[0]) > self._most:
                 self._written.append(Path(self._folder.name) / f"{len(self._written)}.npz")
@@ -223,7 +221,7 @@ def _at_level(points: np.ndarray, level: np.ndarray | int, size: float) -> np.nd
     """(N, 4) voxels of points at a level, or at one each."""
     cells = np.empty((len(points), 4), np.int64)
     cells[:, 3] = level
-    cells[:, :3] = np.floor(np.ldexp(points / size, -cells[:, 3:]))
+    cells[:, :3] = np.floor(points * np.ldexp(1.0 / size, -cells[:, 3:]))
     return cells
 
 
@@ -247,7 +245,13 @@ def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 def _sum_by_key(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows with the same key (N, 4) summed."""
     order, first = _groups(keys @ _ONE_KEY)
-    return keys[order[first]], np.add.reduceat(sums[order], first, axis=0) if len(first) else sums
+    count = np.diff(np.r_[first, len(order)])
+    total, group = sums[order[first]], np.arange(len(first))
+    # Few voxels have many rows: a row of each at a time is half the work of sums over sorted rows.
+    for row in range(1, count.max(initial=0)):
+        group = group[count[group] > row]
+        total[group] += sums[order[first[group] + row]]
+    return keys[order[first]], total
 
 
 def _groups(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

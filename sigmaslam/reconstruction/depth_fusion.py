@@ -9,7 +9,7 @@ the scalar form of the Kalman filter in `sigmaslam_filters`, to which a test hol
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -41,6 +41,8 @@ _FLOW_VARIANCE, _FLOW_SCALE, _GATE_2D = np.float32(0.3**2), 4, 9.21
 _LEAST_SHARE = 0.5
 # Pixels that are measured at a time: arrays of them stay in the cache of a core.
 _PART = 16384
+# A coordinate of what is in no image.
+_OUTSIDE = np.float32(-1e4)
 # What a small step, translation before rotation, adds to normalised coordinates x, y and to the relative depth of a
 # point (a, b, 1) of inverse depth q: linear in q, 1, a and b, the second axis.
 _BY_STEP = np.zeros((3, 4, 6))
@@ -67,8 +69,8 @@ class DepthView:
     @classmethod
     def of(cls, image: np.ndarray, measured: DisparityMap) -> DepthView:
         """The view of a keyframe with such an image (H, W) uint8 and disparities."""
-        sampled = np.dstack([measured.disparity, measured.variance, disparity_slope(measured.disparity)])
-        return cls(image.astype(np.float32), measured, sampled)
+        sampled = cv2.merge([measured.disparity, measured.variance, *disparity_slope(measured.disparity)])
+        return cls(image.astype(np.float32), measured, np.asarray(sampled))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +99,11 @@ class FusedDepth:
         return np.asarray(enough & (self.disparity > 0.0))
 
 
-def disparity_slope(disparity: np.ndarray) -> np.ndarray:
-    """Slopes (H, W, 2) by least squares over the known pixels of a window, which must be of one surface."""
+def disparity_slope(disparity: np.ndarray) -> list[np.ndarray]:
+    """Slopes (H, W) by u and v, least squares over the known pixels of a window, which must be of one surface."""
     radius = _SLOPE_RADIUS
     known = np.isfinite(disparity)
-    weight, value = known.astype(np.float32), np.where(known, disparity, 0.0).astype(np.float32)
+    weight, value = known.astype(np.float32), np.where(known, disparity, np.float32(0.0))
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     ones = np.ones_like(steps)
 
@@ -114,8 +116,8 @@ def disparity_slope(disparity: np.ndarray) -> np.ndarray:
         lever, product = moment(weight, horizontal, vertical), moment(value, horizontal, vertical)
         squared = moment(weight, horizontal**2, vertical**2) - lever**2 / count
         slope = (product - lever * mean / count) / np.maximum(squared, 1.0)
-        slopes.append(np.where(known & (np.abs(slope) < 1.0), slope, 0.0))
-    return np.stack(slopes, axis=-1).astype(np.float32)
+        slopes.append(np.where(known & (np.abs(slope) < 1.0), slope, np.float32(0.0)))
+    return slopes
 
 
 def fuse_depth(
@@ -144,26 +146,24 @@ def fuse_depth(
     variance = np.float32(1.0 - shared) * reference.variance.ravel()[known]
     support, contradictions = np.zeros((2, len(known)), np.uint8)
     cost = np.zeros_like(mean)
-    texture = _texture(image.astype(np.float32)).reshape(2, -1)[:, known]
+    texture = [each.ravel()[known] for each in _texture(image.astype(np.float32))]
+    parts = [slice(first, first + _PART) for first in range(0, max(len(known), 1), _PART)]
     for view, pose, covariance in others:
-        parts = [slice(first, first + _PART) for first in range(0, max(len(known), 1), _PART)]
-        measured = (_measure(view, pose, covariance, rays[:, at], mean[at], variance[at], camera) for at in parts)
-        seen = _Seen.concatenate([replace(of, rows=of.rows + at.start) for of, at in zip(measured, parts, strict=True)])
-        rows = seen.rows
+        step = pose, step_products(covariance)
+        seen = _Seen.concatenate([_measure(view, *step, rays[:, at], mean[at], variance[at], camera) for at in parts])
         noise = np.float32(1.0 - shared) * seen.noise + seen.pose
         # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
-        expected = seen.derivative**2 * variance[rows] + noise + np.float32(shared) * seen.noise + common[rows]
+        expected = seen.derivative**2 * variance + noise + np.float32(shared) * seen.noise + common
         squared = seen.innovation**2
         there = squared <= GATE * expected
         agrees = there & _looks_alike(image, texture, seen, known)
         if np.count_nonzero(agrees) < _LEAST_SHARE * np.count_nonzero(there):
             # Most of the image moves against the pose: it is that of a moving body, and confirms nothing at rest.
             agrees[:] = False
-        cost[rows] += np.where(agrees, squared / expected, 0.0)
-        support[rows] += agrees
-        contradictions[rows] += (there & ~agrees) | (~there & (seen.innovation < 0.0))
-        prior = mean[rows], variance[rows]
-        mean[rows], variance[rows] = kalman_update(*prior, seen.innovation, seen.derivative, noise, agrees)
+        cost += np.where(agrees, squared / expected, np.float32(0.0))
+        support += agrees
+        contradictions += np.where(there, ~agrees, seen.innovation < 0.0)
+        mean, variance = kalman_update(mean, variance, seen.innovation, seen.derivative, noise, agrees)
     # Where the views differ by more than they should, or less, variances are scaled: the mean of the posterior of a
     # scale that has an inverse gamma distribution. That they agree says nothing of what they have in common.
     scale = (_FREEDOM + cost) / (_FREEDOM + support)
@@ -205,19 +205,17 @@ def kalman_update(
 
 @dataclass(frozen=True, slots=True)
 class _Seen(Table):
-    """A measurement of N pixels by another view.
+    """A measurement of N pixels by another view, with an innovation of NaN where no disparity is known there.
 
     Attributes:
         grey: (N,) grey value where the point appears; NaN where it is not in the view.
-        rows: (M,) of the pixels whose disparity is known there.
-        innovation: (M,) that disparity minus the predicted one, pixels.
-        derivative: (M,) of the latter less the former by the state.
-        noise, pose: (M,) variance of the disparity seen, and of what the pose between the views adds, pixels squared.
-        place_u, place_v: (M,) variance of u and v by the state and the pose, pixels squared.
+        innovation: (N,) that disparity minus the predicted one, pixels.
+        derivative: (N,) of the latter less the former by the state.
+        noise, pose: (N,) variance of the disparity seen, and of what the pose between the views adds, pixels squared.
+        place_u, place_v: (N,) variance of u and v by the state and the pose, pixels squared.
     """
 
     grey: np.ndarray
-    rows: np.ndarray
     innovation: np.ndarray
     derivative: np.ndarray
     noise: np.ndarray
@@ -226,10 +224,22 @@ class _Seen(Table):
     place_v: np.ndarray
 
 
+def step_products(covariance: np.ndarray) -> np.ndarray:
+    """(6, 10) float32 covariance of what `_BY_STEP` moves, xx to zz: factors of each product of two of q, 1, a and b.
+
+    Args:
+        covariance: (6, 6) of the step.
+    """
+    factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)]
+    twice = factors + factors.swapaxes(1, 2)
+    twice[:, range(4), range(4)] /= 2.0
+    return np.asarray(twice[:, *np.triu_indices(4)], np.float32)
+
+
 def _measure(
     view: DepthView,
     pose: np.ndarray,
-    covariance: np.ndarray,
+    products: np.ndarray,
     rays: np.ndarray,
     state: np.ndarray,
     variance: np.ndarray,
@@ -242,26 +252,23 @@ def _measure(
     shift = t / focal_baseline
     x, y, z = turned + shift[:, None] * state
     ahead = z * focal_baseline > _MIN_DEPTH * camera.baseline * state
-    inverse = np.where(ahead, 1.0, np.nan).astype(np.float32) / np.where(ahead, z, 1.0)
+    inverse = np.float32(1.0) / np.where(ahead, z, np.float32(np.inf))
     a, b = x * inverse, y * inverse
-    u, v = camera.fx * a + np.float32(camera.cx), camera.fy * b + np.float32(camera.cy)
+    u = np.where(ahead, camera.fx * a + np.float32(camera.cx), _OUTSIDE)
+    v = camera.fy * b + np.float32(camera.cy)
     predicted = state * inverse
-    *sampled, grey = _sample((view.sampled, view.image), u, v)
-    rows = np.flatnonzero(np.isfinite(sampled[0]))
-    disparity, noise, slope_u, slope_v = (each[rows] for each in sampled)
-    a, b, inverse, predicted, variance, ahead = (each[rows] for each in (a, b, inverse, predicted, variance, turned[2]))
+    disparity, noise, slope_u, slope_v, grey = _sample((view.sampled, view.image), u, v)
     # By the state: of the predicted disparity, and of the one seen where the prediction moves to.
     moves_u = np.float32(camera.fx) * (shift[0] - a * shift[2]) * inverse
     moves_v = np.float32(camera.fy) * (shift[1] - b * shift[2]) * inverse
-    derivative = ahead * inverse**2 - slope_u * moves_u - slope_v * moves_v
-    factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)].astype(np.float32)
-    by_pose, place_u, place_v = _pose_variances(factors, a, b, predicted, slope_u, slope_v, camera)
+    derivative = turned[2] * inverse**2 - slope_u * moves_u - slope_v * moves_v
+    by_pose, place_u, place_v = _pose_variances(products, a, b, predicted, slope_u, slope_v, camera)
     place_u, place_v = moves_u**2 * variance + place_u, moves_v**2 * variance + place_v
-    return _Seen(grey, rows, disparity - predicted, derivative, noise, by_pose, place_u, place_v)
+    return _Seen(grey, disparity - predicted, derivative, noise, by_pose, place_u, place_v)
 
 
 def _pose_variances(
-    factors: np.ndarray,
+    products: np.ndarray,
     a: np.ndarray,
     b: np.ndarray,
     disparity: np.ndarray,
@@ -269,17 +276,17 @@ def _pose_variances(
     slope_v: np.ndarray,
     camera: RectifiedStereo,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Variances (M,) of an innovation and of the place u and v by the step, pixels squared.
+    """Variances (N,) of an innovation and of the place u and v by the step, pixels squared.
 
     Args:
-        factors: (6, 4, 4) of the products of q, 1, a and b in the covariance of what `_BY_STEP` moves, xx to zz.
-        a, b: (M,) normalised coordinates of the place.
-        disparity: (M,) predicted there.
-        slope_u, slope_v: (M,) of the disparities seen there.
+        products: (6, 10) as of `step_products`.
+        a, b: (N,) normalised coordinates of the place.
+        disparity: (N,) predicted there.
+        slope_u, slope_v: (N,) of the disparities seen there.
         camera: the rectified pair.
     """
-    terms = np.stack([disparity / np.float32(camera.focal_baseline), np.ones_like(a), a, b])
-    xx, xy, xz, yy, yz, zz = factors.reshape(6, 16) @ (terms[:, None] * terms).reshape(16, -1)
+    q, one = disparity / np.float32(camera.focal_baseline), np.ones_like(a)
+    xx, xy, xz, yy, yz, zz = products @ np.stack([q * q, q, q * a, q * b, one, a, b, a * a, a * b, b * b])
     # The depth moves the place, too, and the slopes there the disparity: it changes by e x + f y + g z.
     e, f = np.float32(camera.fx) * slope_u, np.float32(camera.fy) * slope_v
     g = disparity - e * a - f * b
@@ -289,29 +296,30 @@ def _pose_variances(
     return innovation, place_u, place_v
 
 
-def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.ndarray) -> np.ndarray:
-    """(M,) bool, measured pixels whose windows show the same where the points appear in the other image.
+def _looks_alike(image: np.ndarray, texture: list[np.ndarray], seen: _Seen, known: np.ndarray) -> np.ndarray:
+    """(N,) bool, measured pixels whose windows show the same where the points appear in the other image.
 
     What moves along its own surface has the depth that is expected, and another texture. The variance of the difference
     is held against what noise, the resampling and an uncertain place make of the texture, scaled by the median pixel.
 
     Args:
         image: (H, W) uint8 of the reference.
-        texture: (2, N) as of `_texture`.
+        texture: (N,) each, as of `_texture`.
         seen: of the N points.
         known: (N,) their flat indices in the reference.
     """
     there = np.isfinite(seen.grey)
-    pixels, grey, measured = known[there], seen.grey[there], known[seen.rows]
+    pixels, grey = known[there], seen.grey[there]
     weight, difference = np.zeros((2, *image.shape), np.float32)
     weight.ravel()[pixels] = 1.0
     difference.ravel()[pixels] = image.ravel()[pixels] - grey
-    share, mean, square = (window_mean(each).ravel()[measured] for each in (weight, difference, difference**2))
+    share, mean, square = (window_mean(each) for each in (weight, difference, difference**2))
     share = np.maximum(share, np.float32(1e-3))
     place_u, place_v = seen.place_u + _RESAMPLING, seen.place_v + _RESAMPLING
-    expected = _ROUNDING + texture[0][seen.rows] * place_u + texture[1][seen.rows] * place_v
-    ratio = (square / share - (mean / share) ** 2) / expected
-    alike = ratio <= GATE * (np.median(ratio[::_MEDIAN_STRIDE]) if len(ratio) else 0.0)
+    ratio = (square / share - (mean / share) ** 2).ravel()[known]
+    ratio /= _ROUNDING + texture[0] * place_u + texture[1] * place_v
+    some = ratio[::_MEDIAN_STRIDE][np.isfinite(seen.innovation[::_MEDIAN_STRIDE])]
+    alike = ratio <= GATE * (np.median(some) if len(some) else 0.0)
     # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
     warped = image.copy()
     warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
@@ -319,7 +327,7 @@ def _looks_alike(image: np.ndarray, texture: np.ndarray, seen: _Seen, known: np.
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     search.setFinestScale(0)
     flow = cv2.split(search.calc(small, moved, np.zeros((*small.shape, 2), np.float32)))
-    moved_u, moved_v = (_FLOW_SCALE * cv2.resize(each, image.shape[::-1]).ravel()[measured] for each in flow)
+    moved_u, moved_v = (_FLOW_SCALE * cv2.resize(each, image.shape[::-1]).ravel()[known] for each in flow)
     rests = moved_u**2 / (place_u + _FLOW_VARIANCE) + moved_v**2 / (place_v + _FLOW_VARIANCE)
     return np.asarray(alike & (rests <= _GATE_2D))
 
@@ -335,8 +343,8 @@ def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[
     # OpenCV takes maps of at most 32767 columns, and none without a row.
     columns = 1024
     rows = max(-(-len(u) // columns), 1)
-    maps = np.full((2, rows * columns), -1e4, np.float32)
-    maps[:, : len(u)] = np.where(np.isfinite(u) & np.isfinite(v), [u, v], -1e4)
+    maps = np.full((2, rows * columns), _OUTSIDE, np.float32)
+    maps[0, : len(u)], maps[1, : len(u)] = u, v
     map_u, map_v = maps.reshape(2, rows, columns)
     sampled = []
     for image in images:

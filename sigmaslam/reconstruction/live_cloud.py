@@ -55,7 +55,7 @@ class CloudSink:
             return
         self._since = 0
         offset = said.calibration.disparity_offset
-        view = measure_view(seen.left, seen.right, self._rectifier, semi_global_disparity, offset)
+        view = measure_view(seen.left, seen.right, self._rectifier, semi_global_disparity, offset, seen.usable)
         self._views = [*self._views[-2 * NEIGHBOURS :], (said, seen.left.copy(), view)]
         if len(self._views) > NEIGHBOURS:
             self._fuse(len(self._views) - 1 - NEIGHBOURS)

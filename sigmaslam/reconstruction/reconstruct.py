@@ -26,6 +26,7 @@ from sigmaslam.reconstruction.recorded_keyframes import RecordedKeyframes, open_
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.dense_points import DENSE_NAME, RECONSTRUCTION_NAME, write_dense_points
+from sigmaslam.slam.frame import usable_pixels
 
 NEIGHBOURS = 2
 """Views before, and behind, that a keyframe's depths are fused with."""
@@ -200,7 +201,8 @@ def fuse_keyframes(
     def views() -> Generator[_NumberedView, None, None]:
         for number, frame in keyframes.images(sequence):
             left, right = rectifier.rectify(frame.left, frame.right)
-            yield number, left, measure_view(left, right, rectifier, match, keyframes.disparity_offset)
+            usable = usable_pixels(frame.mask, rectifier)
+            yield number, left, measure_view(left, right, rectifier, match, keyframes.disparity_offset, usable)
 
     for number, left, view in read_ahead(views, 1):
         kept[number] = left, view
@@ -252,13 +254,20 @@ def fuse_keyframe(
 
 
 def measure_view(
-    left: np.ndarray, right: np.ndarray, rectifier: StereoRectifier, match: Matcher, offset: float
+    left: np.ndarray,
+    right: np.ndarray,
+    rectifier: StereoRectifier,
+    match: Matcher,
+    offset: float,
+    usable: np.ndarray | None = None,
 ) -> DepthView:
-    """The disparities of a rectified pair (H, W) uint8 that are not at its border, a disparity offset taken off."""
+    """The usable disparities of a rectified pair (H, W) uint8, not at its border, a disparity offset taken off."""
     measured = measure_disparity(left, right, match)
     disparity = measured.disparity - np.float32(offset)
     if rectifier.valid_mask is not None:
         disparity[cv2.erode(rectifier.valid_mask, np.ones((7, 7), np.uint8)) == 0] = np.nan
+    if usable is not None:
+        disparity[~usable] = np.nan
     return DepthView.of(left, replace(measured, disparity=disparity))
 
 

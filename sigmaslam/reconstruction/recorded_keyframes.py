@@ -48,6 +48,7 @@ class RecordedKeyframes:
         frames: (K,) rows of the views in trajectory.tum.
         pairs: relative poses of the run.
         pair_times: (M, 2) time stamps of their earlier and later frames, seconds.
+        mask: that the run was given.
     """
 
     source: Path
@@ -62,6 +63,7 @@ class RecordedKeyframes:
     frames: np.ndarray
     pairs: FramePairs
     pair_times: np.ndarray
+    mask: Path | None = None
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -107,7 +109,7 @@ class RecordedKeyframes:
             InputError: the sequence lacks one of them.
         """
         wanted = 0
-        with closing(sequence.frames()) as frames:
+        with closing(sequence.at(self.timestamps - _SAME_TIME).frames()) as frames:
             for frame in frames:
                 if frame.timestamp > self.timestamps[wanted] + _SAME_TIME:
                     break
@@ -162,6 +164,7 @@ def read_recorded_keyframes(run: Path, every: int = 1) -> RecordedKeyframes:
         rows,
         pairs,
         said.timestamps[np.stack([pairs.earlier, pairs.later], axis=1)],
+        Path(entries["mask"]) if entries.get("mask") else None,
     )
 
 
@@ -182,7 +185,7 @@ def open_input(keyframes: RecordedKeyframes, moved_to: Path | None = None) -> St
         calibration = Path(scratch) / "calibration.yaml"
         write_calibration(calibration, keyframes.camera)
         try:
-            return open_sequence(source, format, calibration)
+            stored = open_sequence(source, format, calibration)
         except CalibrationError:
             # The run made the images smaller.
             stored = open_sequence(source, format)
@@ -193,6 +196,8 @@ def open_input(keyframes: RecordedKeyframes, moved_to: Path | None = None) -> St
             f"{source}: has images of {stored.camera.left.width}x{stored.camera.left.height} pixels, the run had "
             f"{sizes[1][0]}x{sizes[1][1]}: give the input of this run by --input"
         )
+    if keyframes.mask is not None:
+        sequence.use_masks(keyframes.mask)
     return sequence
 
 

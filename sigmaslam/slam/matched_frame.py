@@ -18,6 +18,7 @@ class MatchedFrame:
         landmark: (M,) numbers of the landmarks that were matched, which no other landmarks of the run have.
         matches: of them.
         agreeing: (M,) bool, the matches that the pose agrees with; None without a pose.
+        usable: (H, W) bool, pixels of the left image that no mask hides; None: all.
     """
 
     left: np.ndarray
@@ -25,6 +26,7 @@ class MatchedFrame:
     landmark: np.ndarray
     matches: GuidedMatches
     agreeing: np.ndarray | None
+    usable: np.ndarray | None = None
 
     @property
     def pixels(self) -> np.ndarray:

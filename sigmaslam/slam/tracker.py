@@ -207,7 +207,7 @@ class StereoTracker:
             self._motion.widen(1.0 / self._motion.widened)
         landmarks = self._window.landmarks.id[matches.views.landmark]
         inliers = None if fit is None else fit.inliers
-        self.last_frame = MatchedFrame(frame.left, frame.right, landmarks, matches, inliers)
+        self.last_frame = MatchedFrame(frame.left, frame.right, landmarks, matches, inliers, frame.usable)
         predicted = filtered = self._motion.state
         if fit is not None:
             matches, fit, doubts = self._scrutiny.doubt(frame.left, matches, fit)

@@ -42,6 +42,22 @@ def test_a_selection_has_the_frames_it_names(
     assert part.sample(1)[0][0].timestamp == whole[expected[0]].timestamp
 
 
+@pytest.mark.parametrize("source", ["files", "a source in order"])
+def test_of_image_files_only_those_at_the_times_are_read(demo_sequence: Path, source: str):
+    sequence = open_sequence(demo_sequence)
+    whole = list(sequence.frames())
+    if source != "files":
+        sequence = sequence_of(whole, sequence.camera)
+    some = sequence.at(np.array([whole[k].timestamp - 1e-4 for k in (2, 7, 7, 39)]))
+    expected = [2, 7, 39] if source == "files" else list(range(40))
+    frames = list(some.frames())
+    assert [frame.timestamp for frame in frames] == [whole[k].timestamp for k in expected]
+    np.testing.assert_array_equal(frames[1].right, whole[expected[1]].right)
+    assert len(list(sequence.frames())) == 40
+    # After the last pair there is none: all are read, and it is the reader's to say so.
+    assert len(list(sequence.at(np.array([whole[-1].timestamp + 1.0])).frames())) == 40
+
+
 def test_a_selection_of_nothing_is_refused(demo_sequence: Path):
     with pytest.raises(InputError, match="has 40 pairs, none from 40 on"):
         open_sequence(demo_sequence).select(Selection(start=40))

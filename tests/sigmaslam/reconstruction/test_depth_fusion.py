@@ -154,9 +154,10 @@ def test_the_derivative_and_the_pose_s_part_are_those_of_differences():
     covariance = root @ root.T
 
     def innovation(state: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        return depth_fusion._measure(view, pose, covariance, rays, state, variance, CAMERA).innovation.astype(float)
+        return depth_fusion._measure(view, pose, products, rays, state, variance, CAMERA).innovation.astype(float)
 
-    found = depth_fusion._measure(view, pose, covariance, rays, state, variance, CAMERA)
+    products = depth_fusion.step_products(covariance)
+    found = depth_fusion._measure(view, pose, products, rays, state, variance, CAMERA)
     step = np.float32(0.2)
     slope = (innovation(state + step, pose) - innovation(state - step, pose)) / (2 * step)
     np.testing.assert_allclose(found.derivative, -slope, atol=0.02)

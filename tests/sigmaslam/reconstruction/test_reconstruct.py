@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnx
 import pytest
@@ -87,6 +88,27 @@ def test_a_cloud_made_while_tracking_is_near_that_of_later_and_changes_no_pose(t
     assert np.median(distance / live.sigma) < 0.5
     assert run_here("track", tracked / "input", "--out", tmp_path / "run", "--overwrite").returncode == 0
     assert not (tmp_path / "run" / "cloud.ply").exists()
+
+
+@pytest.mark.long
+def test_what_a_mask_hides_gives_no_points(tracked: Path, tmp_path: Path):
+    image = cv2.imread(str(next((tracked / "input").rglob("*.png"))), cv2.IMREAD_GRAYSCALE)
+    mask = np.full_like(image, 255)
+    mask[:, mask.shape[1] // 2 :] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    run = tmp_path / "run"
+    arguments = "--mask", tmp_path / "mask.png", "--dense", run / "cloud.ply", "--frames", "6"
+    assert run_here("track", tracked / "input", "--out", run, *arguments).returncode == 0
+    live = read_dense_points(run / "dense.npz").points
+    assert run_here("map", "reconstruct", run, "--out", tmp_path / "cloud.ply").returncode == 0
+    keyframes = read_recorded_keyframes(run)
+    camera, pose = keyframes.camera.left, keyframes.poses[0]
+    for points in (live, read_dense_points(run / "dense.npz").points):
+        seen = (points - pose[:3, 3]) @ pose[:3, :3]
+        u = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx
+        assert len(points) > 300
+        # The camera moves little, and the windows of pixels before the mask end there.
+        assert np.quantile(u, 0.95) < mask.shape[1] // 2
 
 
 def test_voxels_have_a_size_where_the_first_keyframe_has_no_points():
