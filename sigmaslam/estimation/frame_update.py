@@ -159,8 +159,6 @@ class FrameUpdate:
         anchors, pair = np.unique(landmarks.anchor[rows], return_inverse=True)
         is_compiled, dependence = window.graphs.is_compiled, self._padded[2]
         return {
-            **({"rows": rows} if is_compiled else {}),
-            "dependence": dependence if is_compiled else dependence[rows],
             **window.graphs.constants(window.depth),
             "anchors": anchors,
             "views": np.full(len(anchors), len(state)),
@@ -168,7 +166,9 @@ class FrameUpdate:
             "common": common,
             "covariance": landmarks.covariance[rows],
             "estimate": landmarks.estimate[rows],
+            "dependence": dependence if is_compiled else dependence[rows],
             "poses": np.concatenate([state.poses, pose[None]]),
             "calibration": state.calibration,
             "factor": factor,
+            **({"rows": rows} if is_compiled else {}),
         }
