@@ -17,7 +17,8 @@ class Table:
 
     def select(self, rows: np.ndarray) -> Self:
         """The rows of that index or mask."""
-        return type(self)(*(_select(column, rows) for column in self.columns()))
+        index = np.flatnonzero(rows) if rows.dtype == bool else rows
+        return type(self)(*(_select(column, index) for column in self.columns()))
 
     def columns(self) -> list[Any]:
         """The columns in the order of the fields."""
@@ -33,10 +34,11 @@ class Table:
         return cls(*(_concatenate(columns) for columns in zip(*(part.columns() for part in parts), strict=True)))
 
 
-def _select(column: Any, rows: np.ndarray) -> Any:
+def _select(column: Any, index: np.ndarray) -> Any:
     if column is None:
         return None
-    return column.select(rows) if isinstance(column, Table) else column[rows]
+    # `take` needs a third of the time of column[index].
+    return column.select(index) if isinstance(column, Table) else column.take(index, axis=0)
 
 
 def _concatenate(columns: tuple[Any, ...]) -> Any:

@@ -51,7 +51,10 @@ struct Scene {
 
 struct Frame : Scene {
     const double* dependence;
+    const int64_t* rows;  // of the dependence, that views have; null: one after the other
     Matrix factor;
+
+    const double* depends(int view) const { return dependence + 6 * (rows ? rows[view] : view) * state; }
 };
 
 struct Window : Scene {
@@ -85,6 +88,7 @@ public:
 
     template <typename Array = Reals> auto* numbers(const char* name) { return array<Array>(name).data(); }
     double number(const char* name) { return *numbers(name); }
+    bool has(const char* name) const { return feed_.contains(name); }
     int length(const char* name, int axis = 0) { return static_cast<int>(array<Reals>(name).shape(axis)); }
 
     Matrix matrix(const char* name) {
@@ -122,6 +126,8 @@ Frame read_frame(Feed& feed, bool measured) {
     Frame frame;
     read_scene(feed, frame, measured);
     frame.dependence = feed.numbers("dependence");
+    // The compiled steps alone take them: what hundreds of landmarks depend on is not copied then.
+    frame.rows = feed.has("rows") ? feed.numbers<Integers>("rows") : nullptr;
     frame.factor = feed.matrix("factor");
     return frame;
 }
@@ -200,7 +206,7 @@ py::list frame_gated(const py::dict& given) {
     const Matrix prior = feed.matrix("prior");
     const int columns = feed.length("prior", 1);
     // The compiled step alone takes those of the step before: where they are the same the rest is not computed.
-    const bool* inliers = given.contains("inliers") ? feed.numbers<Flags>("inliers") : nullptr;
+    const bool* inliers = feed.has("inliers") ? feed.numbers<Flags>("inliers") : nullptr;
     Step step;
     {
         py::gil_scoped_release release;

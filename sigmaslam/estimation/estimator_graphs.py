@@ -33,7 +33,7 @@ class EstimatorGraphs:
 
     Attributes:
         predict_views, robust_step, gated_step: of a frame, see `sigmaslam_models.estimator.frame_update`.
-        is_compiled: the gated step stops where it confirms the inliers of the step before, if it is given them.
+        is_compiled: these take `rows` of the dependence, too, and the gated one `inliers`, which it stops to confirm.
         eliminate_landmarks, gate_window, condition: of a window, see `sigmaslam_models.estimator.window_solution`.
     """
 

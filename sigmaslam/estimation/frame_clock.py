@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from statistics import median
 
 import numpy as np
 
@@ -90,7 +91,7 @@ class FrameClock:
         self._intervals.append(interval)
         seconds, sigma = self._estimate(np.array(self._intervals))
         # Of bursts the longest interval is the usual one: they end in such, one like the other.
-        usual = float(max(before) if sigma > 0.0 else np.median(before)) if len(before) >= _LEAST else np.inf
+        usual = float(max(before) if sigma > 0.0 else median(before)) if len(before) >= _LEAST else np.inf
         self.late = interval - usual if _SET * usual < interval and usual <= _SLOWEST else 0.0
         is_other = sigma > 0.0 and (self._is_believed or self.interval > _SET * self._seconds)
         stretch = self.interval / self._seconds if is_other else 1.0

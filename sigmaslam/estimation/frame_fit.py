@@ -61,7 +61,7 @@ class FrameFit:
     @property
     def count(self) -> int:
         """How many views agree."""
-        return int(self.inliers.sum())
+        return int(np.count_nonzero(self.inliers))
 
     @property
     def nis_per_dof(self) -> float:

@@ -140,8 +140,11 @@ class FrameUpdate:
         """Factor (n, k) of the covariance of window and frame, which moves on from a keyframe."""
         state = self._window.posterior
         if self._rooted is None or self._rooted[0] is not state:
-            estimated = np.r_[self._window.calibration.estimated, np.ones(6 * len(state), bool)]
-            self._rooted = state, _root_of_part(state.covariance, np.flatnonzero(estimated))
+            part = np.flatnonzero(np.r_[self._window.calibration.estimated, np.ones(6 * len(state), bool)])
+            # Nothing but the part is not zero.
+            root = np.zeros((len(state.covariance), len(part)))
+            root[part] = matrix_root(state.covariance[np.ix_(part, part)])
+            self._rooted = state, root
         return append_moved(self._rooted[1], pose_slice(reference % len(state)), step_covariance)
 
     def _views(
@@ -154,6 +157,7 @@ class FrameUpdate:
             padded = np.pad(landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
             self._padded = state, landmarks.dependence, padded
         anchors, pair = np.unique(landmarks.anchor[rows], return_inverse=True)
+        is_compiled, dependence = window.graphs.is_compiled, self._padded[2]
         return {
             **window.graphs.constants(window.depth),
             "anchors": anchors,
@@ -162,15 +166,9 @@ class FrameUpdate:
             "common": common,
             "covariance": landmarks.covariance[rows],
             "estimate": landmarks.estimate[rows],
-            "dependence": self._padded[2][rows],
+            "dependence": dependence if is_compiled else dependence[rows],
             "poses": np.concatenate([state.poses, pose[None]]),
             "calibration": state.calibration,
             "factor": factor,
+            **({"rows": rows} if is_compiled else {}),
         }
-
-
-def _root_of_part(covariance: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """A (n, k) with A A^T = covariance (n, n), of which nothing but a part (k,) is not zero."""
-    root = np.zeros((len(covariance), len(part)))
-    root[part] = matrix_root(covariance[np.ix_(part, part)])
-    return root

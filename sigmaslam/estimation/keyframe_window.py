@@ -54,6 +54,7 @@ class KeyframeWindow:
         prior: what is known without the landmarks of the window.
         posterior: what is known with them.
         landmarks: estimated with the posterior.
+        places: of landmarks, as `landmark_places` remembers them, and of which solution.
         depth: of the scene that the last keyframe sees, metres.
         calibration: prior of its errors, as far as it is known.
         expected: (15,) errors of the calibration about which its prior holds: zero until the rig changes, or something
@@ -88,6 +89,7 @@ class KeyframeWindow:
         self.worse = 1.0
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
+        self.places: tuple[WindowState, np.ndarray, np.ndarray, np.ndarray] | None = None
         self.depth = 1.0
         self._observations = KeyframeViews()
         self._next_id = 0

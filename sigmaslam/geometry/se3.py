@@ -106,8 +106,8 @@ def rigid_motion(rotation: np.ndarray, translation: np.ndarray | Sequence[float]
 def se3_inverse(T: np.ndarray) -> np.ndarray:
     """Inverses of rigid transforms; (..., 4, 4) -> (..., 4, 4)."""
     T = np.asarray(T)
-    inverse = np.zeros_like(T)
-    rotation = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse = np.zeros(T.shape, T.dtype)
+    rotation = T[..., :3, :3].swapaxes(-1, -2)
     inverse[..., :3, :3] = rotation
     inverse[..., :3, 3] = -(rotation @ T[..., :3, 3:])[..., 0]
     inverse[..., 3, 3] = 1.0

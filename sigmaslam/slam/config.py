@@ -102,6 +102,14 @@ class TrackerConfig:
             if value is not each.default:
                 object.__setattr__(self, each.name, _checked("TrackerConfig", each, value))
 
+    def densities(self, depth: float) -> np.ndarray:
+        """(2,) power spectral densities of accelerations in a scene of that depth (metres): m^2/s^3 and rad^2/s^3."""
+        return np.array([(self.acceleration * depth) ** 2, self.angular_acceleration**2])
+
+    def initial_twist_sigma(self, depth: float) -> np.ndarray:
+        """(6,) standard deviations of a velocity that nothing is known of, m/s and rad/s."""
+        return np.repeat([self.start_speed * depth, self.start_turn], 3)
+
 
 def read_config(path: Path, base: TrackerConfig | None = None) -> TrackerConfig:
     """Settings of a YAML file, `name: value` line by line; those that it does not name stay as in `base`.

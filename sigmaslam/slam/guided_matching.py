@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from sigmaslam.estimation.frame_update import FrameUpdate
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.estimation.mahalanobis import squared_mahalanobis
+from sigmaslam.estimation.mahalanobis import quantiles, squared_mahalanobis
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
 from sigmaslam.frontend.motion_blur import is_blurred, streak_covariance
 from sigmaslam.frontend.plane_alignment import plane_maps
@@ -18,8 +19,8 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import pixels_in
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.config import TrackerConfig
-from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.frame import Frame
+from sigmaslam.slam.landmark_places import landmark_places
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 
 CONFIRMED = 2
@@ -54,14 +55,6 @@ class GuidedMatches:
     def empty(cls) -> GuidedMatches:
         """No match, and no search."""
         return cls(LandmarkViews.empty(), np.zeros(0), np.zeros(0, np.int64))
-
-
-class _Image:
-    """The left image (H, W) uint8 that landmarks are searched for in, and whether it is blurred, asked for once."""
-
-    def __init__(self, pixels: np.ndarray) -> None:
-        self.pixels = pixels
-        self.is_blurred = Deferred(lambda: is_blurred(pixels))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,14 +96,14 @@ class GuidedMatcher:
             reference: the last one by default.
             alone: the view is too far from the keyframes' to share errors with them.
         """
-        count, left = self.config.min_inliers, _Image(view.left)
+        count = self.config.min_inliers
         parts: list[tuple[np.ndarray, KeypointSearch, TemporalMatches]] = []
         for anchor, rows, search in self._searches(view.usable, keyframes, pose, covariance, reference):
             matches = self.frontend.match(search, view).within(view.usable)
             if alone and anchor != reference % len(keyframes) and len(matches) < count:
                 continue  # a few that agree by chance would connect keyframes that hardly see each other
             parts.append((rows, search, matches))
-        return self._measured(parts, left, alone)
+        return self._measured(parts, view.left, alone)
 
     def follow(
         self,
@@ -150,7 +143,7 @@ class GuidedMatcher:
             (rows, search, matches.within(frame.usable))
             for (rows, search), matches in zip(searches, found, strict=True)
         ]
-        return self._measured(parts, _Image(frame.left), alone=False), excess
+        return self._measured(parts, frame.left, alone=False), excess
 
     def _searches(
         self,
@@ -167,7 +160,8 @@ class GuidedMatcher:
             return
         predicted, S, in_front = self.update.predict(rows, pose, covariance, reference)
         S = S[:, :2, :2] + np.eye(2)
-        inside = in_front & self._in_image(predicted)
+        u, v = predicted[:, 0], predicted[:, 1]
+        inside = in_front & (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
         # The larger eigenvalue.
         across = np.hypot(0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1])
         inside &= 0.5 * (S[:, 0, 0] + S[:, 1, 1]) + across < self.config.search_limit**2
@@ -181,7 +175,7 @@ class GuidedMatcher:
             if key.slope is not None:
                 slope[some] = key.slope[feature[some]]
         T_view_key = se3_inverse(pose) @ self.window.posterior.poses
-        measured = self.window.as_calibrated(landmarks.estimate[rows])
+        measured = landmark_places(self.window)[0].take(rows, axis=0)
         maps = plane_maps(self.camera, measured, slope, T_view_key[anchors])
         for anchor, (key, some) in enumerate(zip(keyframes, chosen, strict=True)):
             if len(some) < _MIN_LANDMARKS:
@@ -191,21 +185,21 @@ class GuidedMatcher:
             yield anchor, rows[some], search
 
     def _measured(
-        self, parts: list[tuple[np.ndarray, KeypointSearch, TemporalMatches]], left: _Image, alone: bool
+        self, parts: list[tuple[np.ndarray, KeypointSearch, TemporalMatches]], left: np.ndarray, alone: bool
     ) -> GuidedMatches:
         """Matches of keyframes, each with the rows that were searched for, as views of landmarks."""
         if not parts:
             return GuidedMatches.empty()
         matches = TemporalMatches.concatenate([found for _, _, found in parts])
         noise, common = self.noise.of_matches(matches), np.zeros((len(matches), 3, 2))
-        landmarks, streaked, end = [], False, 0
+        landmarks, streaked, end, is_view_blurred = [], False, 0, cache(lambda: is_blurred(left))
         for rows, search, found in parts:
             # Features of a keyframe ascend with the rows of its landmarks.
             landmarks.append(rows[np.searchsorted(search.index, found.key_index)])
             key, begin, end = search.key, end, end + len(found)
-            if not (key.is_blurred or left.is_blurred.get()):
+            if not (key.is_blurred or is_view_blurred()):
                 continue
-            streak = streak_covariance(key.left, left.pixels, key.features.keypoints[found.key_index], found.points)
+            streak = streak_covariance(key.left, left, key.features.keypoints[found.key_index], found.points)
             if streak is not None:
                 # They share it: all of them say no more of it than one.
                 noise[begin:end, :2, :2] += len(found) * streak
@@ -215,10 +209,6 @@ class GuidedMatcher:
         views = LandmarkViews(np.concatenate(landmarks), matches.measured, noise, common)
         return GuidedMatches(views, matches.probability, np.concatenate([rows for rows, _, _ in parts]), streaked)
 
-    def _in_image(self, predicted: np.ndarray) -> np.ndarray:
-        u, v = predicted[:, 0], predicted[:, 1]
-        return np.asarray((u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height))
-
 
 def _excess(departure: np.ndarray, covariance: np.ndarray) -> float:
     """By what covariances (K, 2, 2) are too small for the smaller departures (K, 2), 1 or more; NaN: unknown."""
@@ -226,4 +216,4 @@ def _excess(departure: np.ndarray, covariance: np.ndarray) -> float:
     if known.sum() < _MIN_LANDMARKS:
         return 1.0
     squared = squared_mahalanobis(departure[known], covariance[known])
-    return max(1.0, float(np.quantile(squared, _RIGHT)) / _CHI_SQUARE_RIGHT)
+    return max(1.0, float(quantiles(squared, np.array(_RIGHT))) / _CHI_SQUARE_RIGHT)

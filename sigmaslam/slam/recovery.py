@@ -19,7 +19,6 @@ from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks, Mapper, NewKeyframe
-from sigmaslam.slam.motion_prior import densities, initial_twist_sigma
 from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.relocalisation import Relocalisation
 from sigmaslam.slam.rig_change import RigChange
@@ -128,7 +127,7 @@ class Recovery:
         self._start(first, started_at)
         if had_moved:
             course.resume(started_at)
-        self.motion.predict(timestamp - started_at, densities(self.config, self.window.depth), timestamp=timestamp)
+        self.motion.predict(timestamp - started_at, self.config.densities(self.window.depth), timestamp=timestamp)
 
     def _start(self, view: StereoView, timestamp: float) -> KeyframeTracks:
         """Makes the view the first keyframe, and its camera the world where no other one is given."""
@@ -142,5 +141,5 @@ class Recovery:
     def _insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe that sees no known landmark; its velocity is unknown."""
         tracks = self.mapper.insert(new)
-        self.motion.set_twist(np.zeros(6), initial_twist_sigma(self.config, self.window.depth))
+        self.motion.set_twist(np.zeros(6), self.config.initial_twist_sigma(self.window.depth))
         return tracks

@@ -124,7 +124,7 @@ class Scrutiny:
         ways = np.linalg.norm(ways, axis=1)
         moves = ways > 3.0 * ACCEPTANCE.stands
         if self._before is None or 2 * moves.sum() > np.isfinite(ways).sum():
-            _, now, then = np.intersect1d(ids, old_ids, return_indices=True)
+            _, now, then = np.intersect1d(ids, old_ids, assume_unique=True, return_indices=True)
             stays = moves[now] & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
             is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves[now].sum()
             self._fixed_for = _SPOILT if is_fixed else max(self._fixed_for - 1, 0)

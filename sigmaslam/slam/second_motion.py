@@ -10,6 +10,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.chi_square import CHI_SQUARE_99_OF_6, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
+from sigmaslam.estimation.mahalanobis import quantiles
 from sigmaslam.estimation.prediction_errors import surprise
 from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
@@ -21,7 +22,7 @@ from sigmaslam.two_view.scene_pose import are_one_place, see_the_same, stands_be
 from sigmaslam.two_view.stereo_pose import MIN_POINTS, estimate_relative_pose
 
 # Shares of the matches that are farther than those that may be on what moves before the scene.
-_FARTHER = (0.8, 0.65, 0.5)
+_FARTHER = np.array([0.8, 0.65, 0.5])
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +127,7 @@ def find_scene_behind(
         fit = localiser.fit_again(matches, fit, prediction)
     disparity = window.landmarks.estimate[rows, 2]
     drawn_by, most = np.zeros(6), 0.0
-    for least in np.quantile(disparity[fit.inliers], _FARTHER):
+    for least in quantiles(disparity[fit.inliers], _FARTHER):
         near = disparity > least
         drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
         pull = fit.scores[drawn].sum(axis=0)

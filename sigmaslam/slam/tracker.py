@@ -45,7 +45,6 @@ from sigmaslam.slam.loop_closure import LoopCloser
 from sigmaslam.slam.mapping import Mapper
 from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.measurement_noise import MeasurementNoise
-from sigmaslam.slam.motion_prior import densities, initial_twist_sigma
 from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.recovery import Recovery
@@ -195,9 +194,9 @@ class StereoTracker:
         if self._course.timestamp is not None:
             seconds, sigma, stretch = self._clock.tick(timestamp - self._course.timestamp)
             if stretch != 1.0:
-                twist_sigma = initial_twist_sigma(self.config, self._window.depth)
+                twist_sigma = self.config.initial_twist_sigma(self._window.depth)
                 self._motion.set_twist(self._motion.twist / stretch, twist_sigma)
-            self._motion.predict(seconds, densities(self.config, self._window.depth), sigma, timestamp)
+            self._motion.predict(seconds, self.config.densities(self._window.depth), sigma, timestamp)
         is_repeated = self._last_pairs.is_repeated(left, right)
         matches, fit, change, doubts = GuidedMatches.empty(), None, None, Doubts()
         if not is_repeated and not is_noise(left):

@@ -73,6 +73,17 @@ def test_gated_step_stops_where_it_confirms_the_inliers(inputs):
     assert len(contradicted) == len(whole)
 
 
+@pytest.mark.parametrize("name", FRAME_STEPS)
+def test_rows_of_the_dependence_are_as_good_as_a_copy_of_them(name, inputs):
+    feed = list(feeds(name, inputs))[1]
+    count = len(feed["dependence"])
+    rows = np.random.default_rng(3).permutation(2 * count)[:count]
+    table = np.full((2 * count, *feed["dependence"].shape[1:]), np.nan)
+    table[rows] = feed["dependence"]
+    for a, b in zip(open_step(name)(feed), open_step(name)({**feed, "dependence": table, "rows": rows}), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
 @pytest.mark.long
 def test_view_source_is_that_of_the_modules():
     written = Path(sigmaslam.estimation.__file__).with_name("views.inc").read_text()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sigmaslam.estimation.mahalanobis import squared_mahalanobis
+from sigmaslam.estimation.mahalanobis import quantiles, squared_mahalanobis
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])
@@ -27,3 +27,11 @@ def test_any_leading_dimensions_are_the_same_as_one():
     covariance = root @ root.swapaxes(2, 3) + np.eye(3)
     flat = squared_mahalanobis(residual.reshape(20, 3), covariance.reshape(20, 3, 3))
     np.testing.assert_array_equal(squared_mahalanobis(residual, covariance).ravel(), flat)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 290])
+def test_quantiles_are_those_of_numpy_to_the_bit(count: int):
+    shares = np.array([0.0, 0.3, 0.5, 0.65, 0.8, 1.0])
+    for values in np.random.default_rng(7).exponential(size=(50, count)):
+        for some in (values, np.round(values, 1)):
+            assert quantiles(some, shares).tobytes() == np.quantile(some, shares).tobytes()
