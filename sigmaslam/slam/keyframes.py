@@ -78,11 +78,12 @@ class Keyframes:
         return next(k for k, keyframe in enumerate(self.remembered) if keyframe.id == id)
 
     def poses(self, keyframes: list[KnownKeyframe]) -> np.ndarray:
-        """(K, 4, 4) T_world_keyframe of some that left the window."""
-        place = {keyframe.id: index for index, keyframe in enumerate(self.remembered)}
+        """(K, 4, 4) T_world_keyframe of some, in the window or out of it."""
+        place = {keyframe.id: index for index, keyframe in enumerate([*self.remembered, *self.active])}
         origin = np.array([place[keyframe.origin] for keyframe in keyframes], np.int64)
         steps = np.array([keyframe.step for keyframe in keyframes]).reshape(-1, 4, 4)
-        return np.asarray(self._window.posterior.past.poses[origin] @ steps)
+        state = self._window.posterior
+        return np.asarray(np.concatenate([state.past.poses, state.poses])[origin] @ steps)
 
     def left_long_ago(self, count: int = 0) -> list[KnownKeyframe]:
         """Keyframes that left the window, but for the last `count`, by their numbers upwards."""

@@ -1,4 +1,4 @@
-"""Relocalisation: a lost view is found among the keyframes that left the window, or in a map."""
+"""Relocalisation: a lost view is found in the last keyframe, among those that left the window, or in a map."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
@@ -41,7 +40,7 @@ class Relocalisation:
 
 @dataclass(frozen=True, slots=True)
 class Relocaliser:
-    """Finds views among remembered keyframes.
+    """Finds views in the last keyframe and among remembered ones.
 
     Attributes:
         window: emptied where a view is found.
@@ -65,15 +64,20 @@ class Relocaliser:
         if not view.has_stereo(min_points, self.min_inliers):
             return None
         keyframes = self.keyframes
-        for keyframe in retrieve(view, _RETRIEVED, keyframes.left_long_ago(), keyframes.appearance):
-            relative = self.matcher.relative_pose_to(keyframe.view, view)
+        # Features of the last one may be many where none of its landmarks is found again.
+        last = keyframes.active[-1:]
+        for keyframe in [*last, *retrieve(view, _RETRIEVED, keyframes.left_long_ago(), keyframes.appearance)]:
+            relative, is_last = self.matcher.relative_pose_to(keyframe.view, view), keyframe in last
             if relative is None:
                 continue
             pose = nearest_rigid(keyframes.poses([keyframe])[0] @ relative.T_key_camera)
             # Repeated texture agrees on other places: by a few dozens of matches, which the motion since the last image
-            # excludes if that was guessed, or by hundreds, which it excludes if that was measured.
-            trusts_motion = dead_reckoning(self.motion) is not None or not self.matcher.is_beyond_chance(relative)
-            if trusts_motion and not self._is_expected(pose):
+            # excludes if that was guessed, or by hundreds, which it excludes if that was measured. Landmarks of the
+            # last one spoke against its pose: both must speak for it.
+            is_clear = self.matcher.is_beyond_chance(relative)
+            excludes = len(self.window) > 0 and Prediction.of(self.window, self.motion).excludes(pose)
+            trusts_motion = dead_reckoning(self.motion) is not None or not is_clear or is_last
+            if (trusts_motion and excludes) or (is_last and not is_clear):
                 continue
             admitted = view.only(self.admission.admit(view, pose, self.window))
             if not admitted.has_stereo(min_points, self.min_inliers):
@@ -84,9 +88,3 @@ class Relocaliser:
             covariance = from_origin(keyframe, shared).covariance
             return Relocalisation(admitted, pose, covariance, keyframes.index(keyframe.origin))
         return None
-
-    def _is_expected(self, pose: np.ndarray) -> bool:
-        """Whether the motion may have led to a pose (4, 4) since the last one."""
-        if not len(self.window):
-            return True
-        return Prediction.of(self.window, self.motion).squared_departure(pose) <= CHI_SQUARE_9999_OF_6

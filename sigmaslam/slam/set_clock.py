@@ -46,7 +46,9 @@ def by_times(localiser: Localiser, localise: Callable[[], Found]) -> Found:
     else:
         motion.restore(*as_stamped)
     if fit is None:
-        motion.doubt_time(late)
+        # Any moment in between is as likely: a camera is in no place that it left before the earlier one.
+        go_back(motion, 0.5 * late)
+        motion.doubt_time(late / np.sqrt(12.0))
     elif other is not None and not is_same and is_rival(other.count, fit.count):
         matches = replace(matches, rival=other.pose)
     return matches, fit, None

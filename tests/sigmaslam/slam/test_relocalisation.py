@@ -1,6 +1,6 @@
 """Keyframes that left the window: kept within bounds, found again, and a map to localise in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -396,6 +396,28 @@ def test_an_array_in_place_of_a_map_is_refused_without_advice_to_unpickle(tmp_pa
     ],
 )
 def test_no_place_is_found_that_the_motion_excludes(away: float, inliers: int, is_measured: bool, is_found: bool):
+    relocaliser = relocaliser_where(range(2), 0.1 + away, inliers, is_measured)
+    assert (relocaliser.relocalise(view_of(0, 80)) is not None) == is_found
+    assert len(relocaliser.window) == (0 if is_found else 1)
+
+
+@pytest.mark.parametrize(("away", "inliers", "is_found"), [(0.01, 60, True), (0.01, 20, False), (5.0, 60, False)])
+def test_a_view_is_found_in_the_last_keyframe_where_motion_and_many_features_agree(
+    away: float, inliers: int, is_found: bool
+):
+    relocaliser = relocaliser_where([1], away, inliers)
+    found = relocaliser.relocalise(view_of(0, 80))
+    assert (found is not None) == is_found
+    if found is not None:
+        assert found.origin == relocaliser.keyframes.index(1)
+        np.testing.assert_allclose(found.pose, looking(0.1 + away), atol=1e-12)
+
+
+def relocaliser_where(seen: Iterable[int], x: float, inliers: int, is_measured: bool = False) -> Relocaliser:
+    """After a keyframe at 0 that left the window and one at 0.1 that did not; views are x beside those that are seen.
+
+    The motion expects no step, to 0.1.
+    """
     keyframes = visited([looking(0.0)], 10)
     window = keyframes._window
     window.add_keyframe(looking(0.1), looking(0.1), 1e-4 * np.eye(6), NO_WALK, 1.0)
@@ -407,11 +429,15 @@ def test_no_place_is_found_that_the_motion_excludes(away: float, inliers: int, i
         is_odometric=False,
         reckoning="inertial",
     )
-    found = RelativePose(looking(0.1 + away), np.arange(80) < inliers, 1e-4 * np.eye(6), 1.0)
-    matcher = SimpleNamespace(relative_pose_to=lambda key, view: found, is_beyond_chance=lambda found: inliers > 45)
-    relocaliser = Relocaliser(window, keyframes, motion, matcher, AdmitAll(10, 12.0), 15)
-    assert (relocaliser.relocalise(view_of(0, 80)) is not None) == is_found
-    assert len(window) == (0 if is_found else 1)
+    relative = RelativePose(looking(x), np.arange(80) < inliers, 1e-4 * np.eye(6), 1.0)
+    known = [
+        view for number, view in enumerate((keyframes.remembered[0].view, keyframes.active[0].view)) if number in seen
+    ]
+    matcher = SimpleNamespace(
+        relative_pose_to=lambda key, view: relative if any(key is each for each in known) else None,
+        is_beyond_chance=lambda found: inliers > 45,
+    )
+    return Relocaliser(window, keyframes, motion, matcher, AdmitAll(10, 12.0), 15)
 
 
 # ---- the tracker

@@ -57,15 +57,17 @@ def test_of_two_times_the_one_that_the_image_shows_is_taken(tracked: Tracked, sp
     np.testing.assert_allclose(motion.step, here, atol=0.02)
 
 
-def test_where_neither_time_gives_a_pose_the_prediction_spans_both(tracked: Tracked):
+def test_where_neither_time_gives_a_pose_the_prediction_spans_both_and_no_more(tracked: Tracked):
     tracker, *_ = tracked
     motion = tracker._motion
     motion.set_twist(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.full(6, 1e-3))
     motion.predict(0.5, np.full(2, 1e-4))
-    step, tracker._clock.late = motion.step, 0.5
+    late, tracker._clock.late = motion.step, 0.5
     assert by_times(tracker._localiser, lambda: (GuidedMatches.empty(), None, None))[1] is None
-    np.testing.assert_array_equal(motion.step, step)
-    assert motion.step_covariance[0, 0] == pytest.approx(0.25, rel=0.1)
+    sigma = np.sqrt(motion.step_covariance[0, 0])
+    away = [late[0, 3] - along - motion.step[0, 3] for along in (0.0, 0.5, 2.0)]
+    assert np.abs(away[:2]) / sigma == pytest.approx(np.sqrt(3.0), rel=0.05)  # a uniform density of half a second
+    assert abs(away[2]) > 8.0 * sigma  # two seconds ago the camera was elsewhere
 
 
 def test_a_rival_is_said_and_the_covariance_spans_both(demo: Demo, monkeypatch: pytest.MonkeyPatch):
