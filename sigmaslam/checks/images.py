@@ -7,6 +7,7 @@ import numpy as np
 from sigmaslam.checks.finding import Finding
 from sigmaslam.frontend.image_sharpness import sharpness
 from sigmaslam.readers.stereo_sequence import StereoFrame
+from sigmaslam.slam.frozen_images import MAX_ALTERNATION
 
 # Grey values at which a camera clips, and the shares of the pixels that may.
 _DARK, _BRIGHT = 5, 250
@@ -20,9 +21,6 @@ _WARN_BLUR = 2.0
 _MAX_LIGHT = 2.0
 # Images are one and the same where they differ by less than the noise of two cameras, grey values.
 _SAME = 0.5
-# Differences of neighbouring lines over those of every other one: 0.56 to 0.68 in seven recordings, 0.95 in noise of 25
-# grey values, 1.3 to 4 where fields are interlaced, 2.5 to 23 where the pixels of a line have colours in turn.
-_MAX_ALTERNATION = 1.15
 EYES = ("left", "right")
 
 
@@ -120,16 +118,14 @@ def _check_sharpness(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
 
 def _check_lines(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
     """Whether rows are of two moments, or pixels of several colours, in turn."""
-    rows, columns = (
-        max(float(np.median([_alternation(turn(pair[eye])) for pair in pairs])) for eye in range(2))
-        for turn in (np.asarray, np.transpose)
-    )
+    lines = [[(_alternation(image), _alternation(image.T)) for image in pair] for pair in pairs]
+    rows, columns = np.median(lines, axis=0).max(axis=0).tolist()
     figure = f"neighbouring rows differ {rows:.2f} times as much as every other one"
-    if rows <= _MAX_ALTERNATION:
+    if rows <= MAX_ALTERNATION:
         return Finding("lines", "ok", figure, rows)
     what = (
-        "interlaced video, whose even and odd rows are of two moments: deinterlace it, or keep every other row"
-        if columns <= _MAX_ALTERNATION
+        "interlaced video, whose even and odd rows are of two moments: even ones alone are tracked; deinterlace it"
+        if columns <= MAX_ALTERNATION
         else "the raw mosaic of a colour sensor: convert it to colour or grey"
     )
     return Finding("lines", "warning", f"{figure}: {what}", rows)

@@ -183,8 +183,8 @@ class StereoTracker:
         # The matrices are small: threads of BLAS would wait for each other for longer than they compute.
         with self._turn, self._blas.limit(limits=1, user_api="blas"):
             seconds = check_frame(left, right, timestamp, self._course.timestamp)
-            # Copies, as drivers fill their buffers again.
-            return self._step(np.array(left), np.array(right), seconds, usable_pixels(mask, self.rectifier))
+            pair = self._last_pairs.of_one_moment(left, right)
+            return self._step(*pair, seconds, usable_pixels(mask, self.rectifier))
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()

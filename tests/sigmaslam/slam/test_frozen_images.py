@@ -48,6 +48,31 @@ def test_a_panel_below_all_images_is_no_old_image():
     assert pairs.is_repeated(new[-1], new[0])
 
 
+def test_interlaced_images_are_of_the_moment_of_their_even_rows_from_then_on(demo: Demo):
+    pairs, shown, (now, later) = LastPairs(), demo[1][0], ((each.left, each.right) for each in demo[1][:2])
+    kept = pairs.of_one_moment(shown.left, shown.right)
+    assert np.array_equal(kept, now)
+    assert not np.shares_memory(kept[0], shown.left)
+    odd = np.arange(len(shown.left))[:, None] % 2 == 1
+    fields = [np.where(odd, np.roll(other, 6, axis=1), one) for one, other in zip(now, later, strict=True)]
+    pairs.of_one_moment(fields[0], now[1])
+    assert np.array_equal(pairs.of_one_moment(*now), now), "one eye alone says nothing"
+    expected = np.array([pairs.of_one_moment(*images) for images in (fields, now)])
+    assert np.array_equal(expected[0, :, :-1], expected[1, :, :-1])
+    assert np.array_equal(expected[1, :, ::2], np.array(now)[:, ::2])
+    between = expected[1, :, 1:-1:2] - 0.5 * (expected[1, :, :-2:2] + 1.0 * expected[1, :, 2::2])
+    assert np.abs(between).max() <= 0.5
+
+
+def test_noise_gains_of_rows_and_tiny_images_are_not_interlaced(demo: Demo):
+    rng, scene = np.random.default_rng(0), demo[1][0].left
+    uneven = np.where(np.arange(len(scene))[:, None] % 2 == 1, scene, 0.98 * scene).astype(np.uint8)
+    noisy = np.clip(scene + rng.normal(0.0, 25.0, scene.shape), 0, 255).astype(np.uint8)
+    noise = rng.integers(0, 256, scene.shape, np.uint8)
+    for image in (uneven, noisy, noise, 0 * noise, noise[:1], noise[:2, :5], noise[:5, :1]):
+        assert np.array_equal(LastPairs().of_one_moment(image, image), (image, image))
+
+
 def test_a_scene_that_moves_behind_what_stays_is_seen_and_noise_and_light_are_none(demo: Demo):
     rng, scene, later = np.random.default_rng(0), demo[1][0].left, demo[1][6].left
     fixed = cv2.GaussianBlur(rng.normal(0.0, 100.0, scene.shape), (0, 0), 0.8)
