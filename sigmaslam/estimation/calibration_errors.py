@@ -8,7 +8,7 @@ Schmidt's filter, which trusts views less for them, every window makes up a cali
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -48,6 +48,8 @@ TURNS = ("yaw", "pitch", "roll")
 # Errors of following are alike all over an image, a little, and keep their sign from keyframe to keyframe. Pixels: of
 # rendered streets, whose turns they add up to.
 _VIEW_TURN = 0.01
+# Others look like those of a pair, however well it is calibrated: this share of usual ones (streets and rooms, too).
+_LEAST_SHARE = 0.07
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +105,13 @@ class CalibrationPrior:
 
         Args:
             camera: the pair.
-            sigmas: of its calibration.
+            sigmas: of its calibration; none counts as smaller than a share of the usual one, 0.07.
             offset_sigma: of the disparity offset, which is estimated, pixels.
             estimate: names of other errors to estimate.
             covariance: of the calibration, in place of `sigmas` for what it names.
         """
+        usual = asdict(CalibrationSigmas())
+        sigmas = CalibrationSigmas(**{k: max(v, _LEAST_SHARE * usual[k]) for k, v in asdict(sigmas).items()})
         turn, lens = camera.fx * sigmas.rotation, camera.fx * sigmas.distortion
         centre = camera.fx * sigmas.principal_point
         in_disparity = (offset_sigma, turn, turn, turn, lens, lens, lens)

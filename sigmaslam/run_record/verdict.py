@@ -120,7 +120,7 @@ def calibration_verdict(
     """
     words = _main_verdict(calibration, frames, points, expected, findings)
     if calibration.worse > 1.0:
-        words += f" Lenses and turns, though, seem about {calibration.worse:.1f} times as far off as the "
+        words += f" Lenses and turns seem about {calibration.worse:.1f} times as far off as the "
         words += "calibration's sigmas say: the covariances hold that."
     return words
 
@@ -154,7 +154,8 @@ def _main_verdict(
             f"The rectification is off by {figure} of disparity. The poses are corrected for it; depth measured with "
             "this calibration elsewhere is not: calibrate again."
         )
-    return f"The disparity offset is {figure}: nothing wrong with the rectification can be seen."
+    seen = "nothing wrong with the rectification can be seen" if calibration.worse == 1.0 else "none can be told"
+    return f"The disparity offset is {figure}: {seen}."
 
 
 def _describe_cause(name: str, probability: float, value: float, sigma: float) -> str:

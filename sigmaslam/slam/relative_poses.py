@@ -14,8 +14,9 @@ import numpy as np
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.published_state import considered_growth, published_state
+from sigmaslam.estimation.published_state import considered_growth
 from sigmaslam.estimation.relative_covariance import frame_relative_to, last_relative_to
+from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.localisation import Prediction
@@ -70,16 +71,14 @@ class RelativePoseReporter:
         # Of the keyframes that poses can be related to: (K,) place behind each other, time stamp, path length.
         self._index, self._times, self._lengths = np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
 
-    def report(self, timestamp: float, fit: FrameFit | None) -> RelativePoses:
+    def report(self, timestamp: float, state: WindowState, fit: FrameFit | None) -> RelativePoses:
         """Relates a frame to the keyframes nearest to each span, if they are near.
 
         Args:
             timestamp: of the frame, seconds.
+            state: of the window, with poses, as it is published.
             fit: its fit to the window; None: the last keyframe moved on, be it the frame itself or a prediction.
         """
-        state = published_state(self._window)
-        if not len(state):
-            return RelativePoses.empty()
         self._note_keyframes()
         prediction = Prediction.of(self._window, self._motion)
         pose = prediction.pose if fit is None else fit.pose

@@ -12,6 +12,7 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.published_state import considered_growth, published_state
 from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
+from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -89,12 +90,12 @@ class Reporter:
             inliers=fit.count if fit is not None else 0,
             nis=fit.nis if fit is not None else 0.0,
             dof=fit.dof if fit is not None else 0,
-            calibration=self._describe_calibration(fit),
+            calibration=self._describe_calibration(state, fit),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
-            relative_poses=self.relative_poses.report(timestamp, fit if tracks is None else None),
+            relative_poses=self.relative_poses.report(timestamp, state, fit if tracks is None else None),
             doubts=tuple(doubts.reasons),
             loop=loop,
             inertial=describe_inertial(self.motion, self.T_rectified_left[:3, :3], T_world_camera),
@@ -114,13 +115,12 @@ class Reporter:
             inliers=0,
             nis=0.0,
             dof=0,
-            calibration=self._describe_calibration(None),
+            calibration=self._describe_calibration(published_state(self.window), None),
             milliseconds=milliseconds,
         )
 
-    def _describe_calibration(self, fit: FrameFit | None) -> CalibrationEstimate:
+    def _describe_calibration(self, state: WindowState, fit: FrameFit | None) -> CalibrationEstimate:
         """As the last keyframe has it, as a frame's own is forgotten; before the second one as the frame has it."""
-        state = published_state(self.window)
         errors, covariance, common = state.calibration, state.covariance, state.common
         if fit is not None and self.window.held_offset.value is None:
             errors, covariance = fit.calibration, fit.joint.covariance

@@ -140,6 +140,6 @@ def test_errors_of_a_bad_calibration_are_as_much_larger_as_their_likelihood_says
         found.append(evidence.worse_by({}))
         assert found[-1] == _WORSE[np.argmax(densities)]
     assert np.median(found) == pytest.approx(worse, rel=0.25)
-    # A file that claims to be exact leaves nothing to be larger.
-    exact = CalibrationPrior.of(CAMERA, CalibrationSigmas.none(), 0.5)
+    # A covariance that claims to be exact leaves nothing to be larger.
+    exact = CalibrationPrior.independent(np.r_[0.5, np.zeros(len(ERRORS) - 1)], "offset")
     assert CalibrationEvidence(exact, CAMERA.fx, load_step("window_condition")).worse_by({}) == 1.0

@@ -5,22 +5,31 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
+from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
+from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend.types import KeypointSearch, StereoView, TemporalMatches
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_trajectory
+from sigmaslam.slam import loop_closure
 from sigmaslam.slam.doubt import Doubt
+from sigmaslam.slam.loop_closure import LoopCloser
 from sigmaslam.slam.relative_poses import SPANS
 from sigmaslam.slam.tracker import StereoTracker
 from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error
 from tests.support.quantiles import chi_square_median, squared_sigmas
 from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, frame_of, run_simulated
 
+CAMERA = RectifiedStereo(450.0, 450.0, 376.0, 240.0, 0.11, 752, 480)
 LAP, FRAMES = 180, 220
 SCALE = SCALES["driving"]
 OFFSET = 0.3
@@ -220,3 +229,23 @@ def test_a_closed_loop_is_not_taken_for_a_wrong_calibration(real_data: Path):
     path = Trajectory(np.array([each.timestamp for each in found]), np.array([each.T_world_camera for each in found]))
     truth = read_trajectory(folder / "groundtruth.csv")
     assert absolute_trajectory_error(path, truth).rmse < 0.04
+
+
+def test_loops_are_sought_as_far_as_a_bad_calibration_makes_the_place_uncertain(monkeypatch: pytest.MonkeyPatch):
+    """A keyframe beyond three standard deviations by the sigmas as they are, and within them by larger ones."""
+    prior = CalibrationPrior.of(CAMERA, CalibrationSigmas(), 0.5)
+    window = KeyframeWindow(CAMERA, prior, EstimatorGraphs(CAMERA, "onnx", unscented=True))
+    window.add_keyframe(np.eye(4), np.eye(4), np.eye(6) * 1e-4, np.zeros(len(ERRORS)), depth=1.0)
+    common = window.posterior.common.copy()
+    common[-6, ERRORS.index("yaw")] = 1.0
+    window.posterior = replace(window.posterior, common=common)
+    old = SimpleNamespace(id=0, timestamp=0.0)
+    newest = SimpleNamespace(id=50, timestamp=9.0, view=None)
+    away = se3_exp(np.array([6.0, 0, 0, 0, 0, 0]))
+    keyframes = SimpleNamespace(left_long_ago=lambda _=0: [old], poses=lambda _: away[None], appearance=None)
+    monkeypatch.setattr(loop_closure, "count_votes", lambda _, asked: np.ones(len(asked)))
+    monkeypatch.setattr(loop_closure, "most_alike", lambda _, asked, __: asked)
+    found = []
+    for window.worse in (1.0, 3.0):
+        found.append(LoopCloser(window, keyframes, None)._revisited(newest)[0])
+    assert found == [None, old]

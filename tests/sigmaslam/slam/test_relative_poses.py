@@ -47,7 +47,11 @@ def nees_by_span(run: SimulatedRun, interval: float) -> dict[str, list[float]]:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "spans"), [("driving", ("10 m", "1 s")), ("drone", ("1 m", "1 s"))])
-def test_errors_are_as_large_as_the_relative_covariance_says(kind: str, spans: tuple[str, str]):
+def test_errors_are_as_large_as_the_relative_covariance_says(
+    kind: str, spans: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+):
+    # These worlds have no errors of following that look like those of a pair.
+    monkeypatch.setattr("sigmaslam.estimation.calibration_errors._LEAST_SHARE", 0.0)
     nees: dict[str, list[float]] = {}
     for seed in range(8):
         for span, values in nees_by_span(simulate(kind, seed, 50), SCALES[kind].interval).items():
