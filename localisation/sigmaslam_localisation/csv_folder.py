@@ -41,6 +41,10 @@ def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True
         seen, sightings = _read(path, ["time", "landmark", *KINDS[kind]], named=1)
     else:
         raise InputError(f"{path}: the header is {','.join(header)}, not time,landmark,range,bearing or ..,ahead,left")
+    if len(set(names)) < len(names):
+        raise InputError(f"{folder / 'landmarks.csv'}: a landmark stands twice")
+    if kind == "range-bearing" and (sightings[:, 1] <= 0.0).any():
+        raise InputError(f"{path}: a range is not positive")
     unknown = sorted(set(seen) - set(names))
     if unknown and not mapping:
         raise InputError(
@@ -73,7 +77,7 @@ def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True
 
 def _header(path: Path) -> list[str]:
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             return [name.strip() for name in next(csv.reader(file), [])]
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from error
@@ -84,7 +88,7 @@ def _read(path: Path, columns: list[str], named: int | None = None) -> tuple[lis
     if _header(path) != columns:
         raise InputError(f"{path}: the header is {','.join(_header(path))}, not {','.join(columns)}")
     names, numbers = [], []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8-sig") as file:
         for line, row in enumerate(csv.reader(file), start=1):
             if line == 1 or not row:
                 continue

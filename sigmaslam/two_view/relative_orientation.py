@@ -51,6 +51,8 @@ _NO_PARALLAX = 2.0
 # All but a few of the inliers are within three standard deviations of where a plane puts them, and their variance is
 # no more than so many times that across the lines, if they are on one.
 _FLAT_SHARE, _FLAT = 0.95, 1.3
+# A match of a larger leverage is nearly alone with what it says: were it wrong, its residual would not show it.
+_LEVERAGE = 0.5
 # Squared distance, in standard deviations per pose, below which two poses are one.
 _SAME = 0.02
 
@@ -122,6 +124,7 @@ def estimate_relative_orientation(
     if _on_plane(rays, weight, best) is not None:
         fits = [_on_plane(rays, weight, fit) or fit for fit in fits]
         best = min(fits, key=lambda fit: fit.cost)
+    fits += _without_levers(rays, weight, best)
     at = _at(rays, best.R, best.direction)
     scores = np.where(best.inliers[:, None], at.J * at.residual[:, None], 0.0)
     clusters = neighbours_factor(pixels0, scores, np.linalg.inv(best.covariance))
@@ -340,6 +343,16 @@ def _on_plane(rays: MatchedRays, probability: np.ndarray, fit: _Fit) -> _Fit | N
     known = known[:5, :5] - known[:5, 5:] @ np.linalg.pinv(known[5:, 5:]) @ known[5:, :5]
     covariance = np.linalg.inv(known / max(1.0, scale) + _PRIOR)
     return replace(_Fit.of(rays, probability, R, direction), covariance=covariance)
+
+
+def _without_levers(rays: MatchedRays, probability: np.ndarray, best: _Fit) -> list[_Fit]:
+    """Fits beside the best one, each without one of its matches that decides a direction nearly alone."""
+    J = _at(rays, best.R, best.direction).J
+    fits = []
+    for match in np.flatnonzero(best.inliers & (((J @ best.covariance) * J).sum(axis=1) > _LEVERAGE * best.scale)):
+        others, rest = rays.chosen(np.arange(len(J)) != match), np.delete(probability, match)
+        fits.append(_Fit.of(others, rest, *_refine(others, rest, best.R, best.direction)))
+    return fits
 
 
 def _mixture(fits: list[_Fit], best: _Fit, clusters: float) -> tuple[np.ndarray, float, tuple[float, float]]:

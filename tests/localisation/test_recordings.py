@@ -83,6 +83,8 @@ def test_without_noise_a_recording_has_no_residuals(tmp_path):
     ("name", "text", "words"),
     [
         ("landmarks.csv", "id,x,y\n1,0,0\n", "landmark,x,y"),
+        ("landmarks.csv", "\ufefflandmark,x,y\n1,0,0\n1,5,5\n", "a landmark stands twice"),
+        ("sightings.csv", "time,landmark,range,bearing\n0.1,1,-1,0\n", "a range is not positive"),
         ("sightings.csv", "time,landmark,range,bearing\n0.1,99,1,0\n", "landmark 99 is not in landmarks.csv"),
         ("controls.csv", "time,speed,turn_rate\n0,one,0\n", "line 2"),
         ("sightings.csv", "time,landmark,a,b\n", "ahead,left"),
