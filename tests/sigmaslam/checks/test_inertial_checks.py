@@ -15,7 +15,7 @@ IMAGES = np.arange(0.5, 4.5, 0.05)
 
 
 def recorded(scale: float = 1.0, shift: float = 0.0, every: int = 1, keep: float = 9.0) -> InertialRecording:
-    samples = Motion(0, size=0.1).measure(np.arange(0, 5, 0.005)).select(slice(None, None, every))
+    samples = Motion(0, size=0.1).measure(np.arange(0, 5, 0.005)[::every])
     samples = samples.select((samples.timestamp < keep) | (samples.timestamp > keep + 0.3))
     samples = InertialSamples(samples.timestamp + shift, samples.gyro, scale * samples.accel)
     return InertialRecording(Path("imu.csv"), SENSOR, samples)
