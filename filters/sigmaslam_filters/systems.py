@@ -119,16 +119,6 @@ def project_stereo(state: Tensor, points: Tensor, camera: Rectified) -> Tensor:
     return torch.stack([u, v, right, v], dim=-1).flatten(-2)
 
 
-def stereo_measurement(points: Tensor, camera: Rectified, noise: Noise | Tensor) -> MeasurementModel:
-    """Stereo pixels of known world points, seen from the 12 states, (9.39)-(9.42).
-
-    Args:
-        points, camera: as `project_stereo`.
-        noise: of the 4m pixels, pixels squared; a `Diagonal` keeps the cost of an update linear in m.
-    """
-    return MeasurementModel(lambda state: project_stereo(state, points, camera), noise)
-
-
 def differential_drive(noise: Noise | Tensor) -> MotionModel:
     """Robot with four wheels that drives and turns, (9.43) and (9.44): states (x, y, theta), metres and radians.
 

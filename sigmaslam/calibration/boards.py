@@ -144,7 +144,8 @@ class AprilGrid:
         ids = (4 * tags[read, None] + [1, 0, 3, 2]).ravel().astype(np.int64)
         pixels = np.concatenate([quads[k].reshape(4, 2) for k in read])
         # The gap to the next tag is the smallest distance between corners.
-        sides = np.repeat([_shortest_side(quads[k].reshape(4, 2)) for k in read], 4)
+        around = pixels.reshape(-1, 4, 2)
+        sides = np.repeat(np.linalg.norm(around - np.roll(around, 1, axis=1), axis=2).min(axis=1).astype(float), 4)
         refined = _refined(image, pixels, sides * self.spacing / _WINDOW_SHARE * 0.5)
         # Quads end inside their corners, blurred by as much.
         moved = np.linalg.norm(refined - pixels, axis=1).reshape(-1, 4).max(axis=1)
@@ -213,7 +214,3 @@ def _nearest_distance(pixels: np.ndarray) -> np.ndarray:
     apart = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(apart, np.inf)
     return np.asarray(apart.min(axis=1))
-
-
-def _shortest_side(quad: np.ndarray) -> float:
-    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min())

@@ -33,11 +33,11 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
     """
     rectifier = StereoRectifier(_pair(rig))
     view = rectifier.rectified
-    uvd = _grid(view)
+    uvd = compared_places(view)
 
     def measured(step: np.ndarray) -> np.ndarray:
         """(M, 3) what the calibrated pair measures where the true one differs by a step."""
-        return _measured(uvd, _pair(rig.moved(step)), rectifier)
+        return measured_places(uvd, _pair(rig.moved(step)), rectifier)
 
     intrinsics = [name.partition(".")[2] in INTRINSICS for name in rig.names]
     sizes = np.where(intrinsics, _STEP_PIXELS, _STEP)
@@ -59,22 +59,12 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
     return CalibrationCovariance(ERROR_NAMES, 0.5 * (matrix + matrix.T)), 1.0 - missing / variance
 
 
-def nearest_errors(calibrated: StereoCamera, true: StereoCamera) -> np.ndarray:
-    """(15,) errors of the tracker that come nearest to what a calibration has wrong, fitted as a covariance is."""
-    rectifier = StereoRectifier(calibrated)
-    uvd = _grid(rectifier.rectified)
-    wrong = (_measured(uvd, true, rectifier) - uvd).ravel()
-    usable = np.isfinite(wrong)
-    by_error = measured_errors(rectifier.rectified, uvd).reshape(-1, len(ERRORS))[usable]
-    return np.asarray(np.linalg.lstsq(by_error, wrong[usable], rcond=None)[0])
-
-
 def _pair(rig: Rig) -> StereoCamera:
     left, right = rig.eyes
     return StereoCamera(left, right, rig.T_left_right)
 
 
-def _grid(view: RectifiedStereo) -> np.ndarray:
+def compared_places(view: RectifiedStereo) -> np.ndarray:
     """(M, 3) places and disparities that both eyes of a rectified pair see."""
     u = np.linspace(0.0, view.width - 1.0, _GRID[0])
     v = np.linspace(0.0, view.height - 1.0, _GRID[1])
@@ -84,7 +74,7 @@ def _grid(view: RectifiedStereo) -> np.ndarray:
     return np.asarray(uvd[uvd[:, 0] - uvd[:, 2] >= 0.0])
 
 
-def _measured(uvd: np.ndarray, true: StereoCamera, rectifier: StereoRectifier) -> np.ndarray:
+def measured_places(uvd: np.ndarray, true: StereoCamera, rectifier: StereoRectifier) -> np.ndarray:
     """(M, 3) what a calibrated pair measures of points that would be at (u, v, disparity) (M, 3) if it were right."""
     view, calibrated, T_right_left = rectifier.rectified, rectifier.camera, se3_inverse(true.T_left_right)
     points = view.triangulate(uvd) @ rectifier.R_rectified_left

@@ -21,13 +21,9 @@ def find_eyes(folder: Path) -> tuple[Path, Path] | None:
     for left, right in EYE_FOLDERS:
         if (folder / left).is_dir() and (folder / right).is_dir():
             return folder / left, folder / right
-    if all(_has_images(folder, eye) for eye in ("left", "right")):
+    if all(any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.glob(f"{eye}*")) for eye in ("left", "right")):
         return folder, folder
     return None
-
-
-def _has_images(folder: Path, prefix: str) -> bool:
-    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.glob(f"{prefix}*"))
 
 
 def open_folder(folder: Path, calibration: Path | None = None) -> StereoSequence:

@@ -79,7 +79,7 @@ def pair_by_name(
         [path for path in list_images(folder) if path.name.startswith(prefix)]
         for folder, prefix in zip(folders, prefixes, strict=True)
     ]
-    keys: list[list[Key]] = [[_numbers(path) for path in side] for side in files]
+    keys: list[list[Key]] = [[tuple(map(int, re.findall(r"\d+", path.stem))) for path in side] for side in files]
     if any(() in side or len(set(side)) < len(side) for side in keys):
         keys = [[path.stem for path in side] for side in files]
     left, right = (dict(zip(side_keys, side, strict=True)) for side_keys, side in zip(keys, files, strict=True))
@@ -101,10 +101,6 @@ def pair_by_name(
             )
         logger.warning("%s: %d frames are left out: %s", left_folder.parent, (~whole).sum(), "; ".join(parts))
     return [(left[key], right[key]) for key in frames if key in left and key in right], whole
-
-
-def _numbers(path: Path) -> tuple[int, ...]:
-    return tuple(int(digits) for digits in re.findall(r"\d+", path.stem))
 
 
 def frame_numbers(files: Sequence[tuple[Path, Path]]) -> list[int] | None:

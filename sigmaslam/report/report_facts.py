@@ -76,12 +76,12 @@ def list_facts(run: RecordedRun) -> Facts:
     if len(position) and np.isfinite(position[-1]):
         facts.append(("sigma at the end", f"{_length(position[-1])}, {np.degrees(rotation[-1]):.2g}°"))
     facts += _errors(run)
-    keyframes = frames.columns["keyframe"]
+    keyframes, inliers = frames.columns["keyframe"], frames.columns["inliers"]
     if np.isfinite(keyframes).any():
         facts.append(("keyframes", f"{np.nansum(keyframes):.0f}"))
         facts.append(("loops", f"{np.isfinite(frames.columns['loop']).sum()}"))
     facts += [
-        ("median inliers", _number(_median(_positive(frames.columns["inliers"])), ".0f")),
+        ("median inliers", _number(_median(inliers[inliers > 0]), ".0f")),
         ("median NIS per dof", _number(_median(nis_per_dof(frames)), ".2f")),
     ]
     if run.map is not None:
@@ -223,10 +223,6 @@ def _length(metres: float) -> str:
         if metres >= size:
             return f"{metres / size:.3g} {unit}"
     return f"{1000 * metres:.3g} mm"
-
-
-def _positive(values: np.ndarray) -> np.ndarray:
-    return values[values > 0]
 
 
 def _median(values: np.ndarray) -> float | None:

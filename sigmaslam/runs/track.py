@@ -327,11 +327,8 @@ def _track(frames: Iterator[StereoFrame], steps: _FrameSteps, rows: _Rows, pictu
             done += 1
             lost += result.status == "lost"
             since = time.perf_counter()
-            note = _note(result.camera, lost, done / (since - began))
+            rate, camera = done / (since - began), result.camera
+            note = f"{rate:.1f} frames/s, {lost} lost; {camera.status}, {camera.inliers} inliers"
             progress.update(task, completed=done + rows.skipped + timing.dropped + rows.sequence.dropped, note=note)
         rows.add_skipped()
         progress.update(task, completed=done + rows.skipped + timing.dropped + rows.sequence.dropped)
-
-
-def _note(estimate: Estimate, lost: int, rate: float) -> str:
-    return f"{rate:.1f} frames/s, {lost} lost; {estimate.status}, {estimate.inliers} inliers"

@@ -32,7 +32,7 @@ def check_tracker_arguments(
     """
     if not isinstance(camera, StereoCamera):
         raise _wrong("camera", camera, "a StereoCamera, such as StereoCamera.from_yaml('stereo.yaml')")
-    if not isinstance(frontend, str) and not _has_methods(frontend):
+    if not isinstance(frontend, str) and not all(hasattr(frontend, name) for name in _FRONTEND_METHODS):
         raise _wrong("frontend", frontend, f"a name, or an object with {', '.join(_FRONTEND_METHODS)}")
     if backend != ONNX and backend not in backend_names():
         raise _wrong("backend", backend, f"one of {', '.join(backend_names())}")
@@ -121,7 +121,3 @@ def check_mask(mask: Any, width: int, height: int) -> None:
 
 def _wrong(name: str, value: object, expected: str) -> InputError:
     return InputError(f"{name} is {shorten(repr(value), 60)}: give {expected}")
-
-
-def _has_methods(frontend: object) -> bool:
-    return all(hasattr(frontend, name) for name in _FRONTEND_METHODS)

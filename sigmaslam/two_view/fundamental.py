@@ -43,20 +43,6 @@ class FundamentalMatrix:
     inliers: np.ndarray
 
 
-def fundamental_by_eight(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """F (3, 3) of the normalised 8-point method, from eight matches (M, 2) or more.
-
-    Raises:
-        ValueError: there are fewer, or they are degenerate.
-    """
-    if len(points0) != len(points1) or len(points0) < _EIGHT:
-        raise ValueError(f"{_EIGHT} matches are needed, got {len(points0)} and {len(points1)} points")
-    F, _ = cv2.findFundamentalMat(points0.astype(np.float64), points1.astype(np.float64), cv2.FM_8POINT)
-    if np.shape(F) != (3, 3):
-        raise ValueError(f"the {len(points0)} matches allow more than one fundamental matrix")
-    return np.asarray(F / np.linalg.norm(F))
-
-
 def estimate_fundamental(
     points0: np.ndarray, points1: np.ndarray, probability: np.ndarray, covariance: np.ndarray, sigma0: float = 0.1
 ) -> FundamentalMatrix | None:

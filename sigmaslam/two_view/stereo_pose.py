@@ -150,7 +150,9 @@ def _from_points(
         reprojectionError=threshold,
         confidence=0.9999,
     )
-    return (_pose(rotation, translation), len(inliers) / len(points)) if succeeded else (None, 0.0)
+    if not succeeded:
+        return None, 0.0
+    return rigid_motion(cv2.Rodrigues(rotation)[0], translation.ravel()), len(inliers) / len(points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +267,3 @@ def _pose_with_inliers(
     size = matches.camera.width, matches.camera.height
     shared = clustering(matches.landmarks[inliers, :2], size, (weighted @ residual[..., None])[..., 0], normal)
     return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal), scale, shared)
-
-
-def _pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    return rigid_motion(cv2.Rodrigues(rotation)[0], translation.ravel())

@@ -28,7 +28,6 @@ from sigmaslam_filters.systems import (
     differential_drive,
     project_stereo,
     range_and_bearing,
-    stereo_measurement,
 )
 from tests.support.filter_builders import covariances, random_numbers, tensor
 
@@ -111,7 +110,8 @@ def test_a_step_of_the_12_states_equals_the_reference(m: int) -> None:
     belief = CUBATURE.predict(
         filters.Gaussian(torch.as_tensor(work.mean), torch.as_tensor(work.covariance)), motion
     ).belief
-    measurement = stereo_measurement(torch.as_tensor(work.points), CAMERA, noise)
+    points = torch.as_tensor(work.points)
+    measurement = filters.MeasurementModel(lambda state: project_stereo(state, points, CAMERA), noise)
     belief = CUBATURE.update(belief, measurement, torch.as_tensor(work.measurement)).belief
     mean, covariance = filter_work.step(work)
     torch.testing.assert_close(belief.mean, torch.as_tensor(mean), rtol=0, atol=1e-10)

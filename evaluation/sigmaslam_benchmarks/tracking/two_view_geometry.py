@@ -11,7 +11,7 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_exp, rotation_log
 from sigmaslam.geometry.uncertainty import propagate
 from sigmaslam.two_view.absolute_orientation import absolute_orientation
-from sigmaslam.two_view.fundamental import FundamentalMatrix, epipolar_lines, estimate_fundamental, fundamental_by_eight
+from sigmaslam.two_view.fundamental import FundamentalMatrix, epipolar_lines, estimate_fundamental
 from sigmaslam.two_view.relative_orientation import estimate_relative_orientation
 from sigmaslam.two_view.triangulation import METHODS, TwoViews, triangulate, triangulate_optimal
 from sigmaslam_benchmarks.tracking.orientation_peers import hard_cases
@@ -70,6 +70,20 @@ def _draw(seed: int, motion: str, wrong: float = _WRONG) -> _Matches:
     bad = rng.random(_COUNT) < wrong
     pixels[bad, 2:] = rng.uniform((0, 0), (620, 500), (int(bad.sum()), 2))
     return _Matches(views, points, pixels, bad)
+
+
+def fundamental_by_eight(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
+    """F (3, 3) of the normalised 8-point method, from eight matches (M, 2) or more.
+
+    Raises:
+        ValueError: there are fewer, or they are degenerate.
+    """
+    if len(points0) != len(points1) or len(points0) < 8:
+        raise ValueError(f"8 matches are needed, got {len(points0)} and {len(points1)} points")
+    F, _ = cv2.findFundamentalMat(points0.astype(np.float64), points1.astype(np.float64), cv2.FM_8POINT)
+    if np.shape(F) != (3, 3):
+        raise ValueError(f"the {len(points0)} matches allow more than one fundamental matrix")
+    return np.asarray(F / np.linalg.norm(F))
 
 
 def _fundamental() -> Iterator[list[str]]:

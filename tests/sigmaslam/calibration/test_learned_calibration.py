@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from sigmaslam.calibration.learned_calibration import learned_calibration
-from sigmaslam.calibration.tracker_covariance import nearest_errors
 from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.estimate import CalibrationEstimate
-from sigmaslam_benchmarks.live.calibration_faults import CALIBRATION_FAULTS
+from sigmaslam_benchmarks.live.calibration_faults import CALIBRATION_FAULTS, nearest_errors
 from tests.support.calibration_forms import raw_rig
 
 PINHOLE = CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5)

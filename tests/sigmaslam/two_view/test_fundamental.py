@@ -10,10 +10,10 @@ from sigmaslam.two_view.fundamental import (
     epipolar_lines,
     epipoles,
     estimate_fundamental,
-    fundamental_by_eight,
     uncertain_epipoles,
 )
 from sigmaslam.two_view.triangulation import TwoViews
+from sigmaslam_benchmarks.tracking.two_view_geometry import fundamental_by_eight
 
 K = np.array([[520.0, 0.0, 310.0], [0.0, 500.0, 250.0], [0.0, 0.0, 1.0]])
 SIGMA = 0.5

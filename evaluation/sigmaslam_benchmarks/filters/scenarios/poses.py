@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam_benchmarks.filters.scenarios.scenario import Scenario, normal
 from sigmaslam_filters import Diagonal, Gaussian, LinearMotion, MeasurementModel, MotionModel, stack, wrap_angle
-from sigmaslam_filters.systems import constant_velocity_over, project_stereo, stereo_measurement
+from sigmaslam_filters.systems import constant_velocity_over, project_stereo
 
 CAMERA = RectifiedStereo(fx=718.0, fy=718.0, cx=607.0, cy=185.0, baseline=0.54, width=1241, height=376)
 
@@ -120,7 +120,8 @@ def _stereo_scenario(
     pixels = project_stereo(states, points, CAMERA)
     values = pixels + pixel_sigma * normal(generator, *pixels.shape)
     noise = Diagonal(torch.full(pixels.shape[-1:], pixel_sigma**2, dtype=torch.float64))
-    return Scenario(states, values, prior, motion, stereo_measurement(points, CAMERA, noise), position=(0, 2, 4))
+    measurement = MeasurementModel(lambda state: project_stereo(state, points, CAMERA), noise)
+    return Scenario(states, values, prior, motion, measurement, position=(0, 2, 4))
 
 
 def _pose_prior(sigma: Sequence[float]) -> tuple[Tensor, Tensor]:
