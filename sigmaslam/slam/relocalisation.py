@@ -58,14 +58,19 @@ class Relocaliser:
     admission: LandmarkAdmission
     min_inliers: int
 
-    def relocalise(self, view: StereoView) -> Relocalisation | None:
-        """Finds the view and moves all keyframes of the window to the past; None, and no change, if it is nowhere."""
+    def relocalise(self, view: StereoView, after_gap: bool) -> Relocalisation | None:
+        """Finds the view and moves all keyframes of the window to the past; None, and no change, if it is nowhere.
+
+        Args:
+            view: the current one.
+            after_gap: the last keyframe is asked, too. Without one, its landmarks are lost because the rig has changed.
+        """
         min_points = self.admission.min_points
         if not view.has_stereo(min_points, self.min_inliers):
             return None
         keyframes = self.keyframes
         # Features of the last one may be many where none of its landmarks is found again.
-        last = keyframes.active[-1:]
+        last = keyframes.active[-1:] if after_gap else []
         for keyframe in [*last, *retrieve(view, _RETRIEVED, keyframes.left_long_ago(), keyframes.appearance)]:
             relative, is_last = self.matcher.relative_pose_to(keyframe.view, view), keyframe in last
             if relative is None:

@@ -224,7 +224,7 @@ class StereoTracker:
             frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
             tracks = self._recovery.go_on_after_bump(change, frame.view, timestamp)
             status = "lost" if tracks is None else doubts.status
-        elif (found := self._relocaliser.relocalise(frame.view)) is not None:
+        elif (found := self._relocaliser.relocalise(frame.view, self._clock.late > 0.0)) is not None:
             status = "relocalised"
             tracks = self._recovery.resume(found, timestamp)
         else:

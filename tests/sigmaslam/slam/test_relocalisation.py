@@ -397,7 +397,7 @@ def test_an_array_in_place_of_a_map_is_refused_without_advice_to_unpickle(tmp_pa
 )
 def test_no_place_is_found_that_the_motion_excludes(away: float, inliers: int, is_measured: bool, is_found: bool):
     relocaliser = relocaliser_where(range(2), 0.1 + away, inliers, is_measured)
-    assert (relocaliser.relocalise(view_of(0, 80)) is not None) == is_found
+    assert (relocaliser.relocalise(view_of(0, 80), after_gap=True) is not None) == is_found
     assert len(relocaliser.window) == (0 if is_found else 1)
 
 
@@ -406,7 +406,8 @@ def test_a_view_is_found_in_the_last_keyframe_where_motion_and_many_features_agr
     away: float, inliers: int, is_found: bool
 ):
     relocaliser = relocaliser_where([1], away, inliers)
-    found = relocaliser.relocalise(view_of(0, 80))
+    assert relocaliser.relocalise(view_of(0, 80), after_gap=False) is None
+    found = relocaliser.relocalise(view_of(0, 80), after_gap=True)
     assert (found is not None) == is_found
     if found is not None:
         assert found.origin == relocaliser.keyframes.index(1)
