@@ -200,7 +200,7 @@ def test_wrong_loops_spoil_nothing():
 @pytest.mark.slow
 def test_two_loops_that_agree_outweigh_a_covariance_that_is_too_small():
     """The first contradicts it and is refused; at the second, the poses are moved, and less certain than they were."""
-    frontend = LapFrontend(0, drift=0.08)
+    frontend = LapFrontend(0, drift=0.05)
     run = run_simulated(StereoTracker(frontend.camera, frontend), frontend, SCALE)
     assert [e.status for e in run.estimates[1:]] == ["tracking"] * (FRAMES - 1)
 
