@@ -7,7 +7,7 @@ import numpy as np
 from sigmaslam.checks.finding import Finding
 from sigmaslam.frontend.image_sharpness import sharpness
 from sigmaslam.readers.stereo_sequence import StereoFrame
-from sigmaslam.slam.frozen_images import MAX_ALTERNATION
+from sigmaslam.slam.frozen_images import MAX_ALTERNATION, alternation
 
 # Grey values at which a camera clips, and the shares of the pixels that may.
 _DARK, _BRIGHT = 5, 250
@@ -118,7 +118,7 @@ def _check_sharpness(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
 
 def _check_lines(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
     """Whether rows are of two moments, or pixels of several colours, in turn."""
-    lines = [[(_alternation(image), _alternation(image.T)) for image in pair] for pair in pairs]
+    lines = [[(alternation(image), alternation(image.T)) for image in pair] for pair in pairs]
     rows, columns = np.median(lines, axis=0).max(axis=0).tolist()
     figure = f"neighbouring rows differ {rows:.2f} times as much as every other one"
     if rows <= MAX_ALTERNATION:
@@ -129,11 +129,6 @@ def _check_lines(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:
         else "the raw mosaic of a colour sensor: convert it to colour or grey"
     )
     return Finding("lines", "warning", f"{figure}: {what}", rows)
-
-
-def _alternation(image: np.ndarray) -> float:
-    values = image.astype(np.int16)
-    return float(np.abs(values[1:] - values[:-1]).mean() / max(np.abs(values[2:] - values[:-2]).mean(), 1e-3))
 
 
 def _check_same(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:

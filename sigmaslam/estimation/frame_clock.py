@@ -123,7 +123,7 @@ class FrameClock:
 
 def _first_noise(steps: np.ndarray) -> float:
     """Of too few intervals for a moment: those that differ, but not by whole frames, show at once."""
-    if len(steps) < 2 or steps.mean() > _SLOWEST or np.ptp(steps) <= _BELIEVED * steps.mean() or _are_multiples(steps):
+    if len(steps) < 2 or steps.mean() > _SLOWEST or _are_multiples(steps):
         return 0.0
     return float(steps.std())
 

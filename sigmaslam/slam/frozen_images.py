@@ -113,18 +113,23 @@ def shows_motion(before: np.ndarray, now: np.ndarray) -> bool:
     return bool(2 * changed.sum() > scene.sum() > 0)
 
 
+def alternation(image: np.ndarray) -> float:
+    """Mean difference of neighbouring rows of an (H, W) uint8 image over that of every other one."""
+    near, far = (cv2.norm(image[by:], image[:-by], cv2.NORM_L1) / image[by:].size for by in (1, 2))
+    return near / max(far, 1e-3)
+
+
 def _shows_fields(image: np.ndarray) -> bool:
     """Whether odd rows of an (H, W) uint8 image are aside of what is between even ones, or nothing like it."""
     size = image.shape[1] // 2, (len(image) - 2) // 4
     if min(size) < 1:
         return False
-    near, far = (cv2.norm(image[by:], image[:-by], cv2.NORM_L1) for by in (1, 2))
     above, odd, below = (cv2.resize(image[k::4][: size[1]], size).astype(np.float32) for k in range(3))
     between = 0.5 * (above + below)
     slope = cv2.Sobel(between, cv2.CV_32F, 1, 0, ksize=1)
     parts = [cv2.resize(each, (4, 3), interpolation=cv2.INTER_AREA) for each in (slope * (odd - between), slope**2)]
     is_aside = 4.0 * np.abs(parts[0]) > _FIELDS * parts[1]
-    return bool(near > MAX_ALTERNATION * far or 2 * is_aside.sum() > is_aside.size)
+    return bool(alternation(image) > MAX_ALTERNATION or 2 * is_aside.sum() > is_aside.size)
 
 
 class _Probed:
