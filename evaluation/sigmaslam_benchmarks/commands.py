@@ -150,13 +150,6 @@ BENCHMARKS = {
             _repeated("peers", "--peer", Path, ".onnx of another extractor to compare with", False),
             _names("sets", "Sets to score, with commas."),
             _count("rounds", 15, "In which every extractor is timed."),
-            _option(
-                "exchange",
-                "--exchange",
-                bool,
-                "Whose keypoints or descriptors lose wide pairs instead; --peer is a checkout of EdgePoint2.",
-                False,
-            ),
         ),
         _TRAIN,
     ),

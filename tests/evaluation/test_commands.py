@@ -25,7 +25,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     taken: list[dict[str, Any]] = []
 
     def write_features(
-        path, figure, data, weights, peers, workers, command, sets="all of them", rounds=1, exchange=False
+        path, figure, data, weights, peers, workers, command, sets="all of them", rounds=1
     ):
         taken.append(locals())
         return "the page"

@@ -52,12 +52,8 @@ class EdgePoint2Extractor(nn.Module):
         descriptors, response = self.network(image)
         # Scores of peaks are positive, whatever the sign of the network's.
         keypoints, scores = _best(response, response.sigmoid() * _inner(response, _EDGEPOINT2_BORDER))
-        return keypoints, scores, self.describe(image, descriptors, keypoints)
-
-    def describe(self, image: Tensor, descriptors: Tensor, keypoints: Tensor) -> Tensor:
-        """Descriptors (N, 64) at keypoints (N, 2) of an image from the network's map of it."""
         size = torch.tensor([image.shape[3], image.shape[2]], dtype=image.dtype)
-        return _sample(descriptors, 2.0 * (keypoints + 0.5) / size - 1.0, "bilinear")
+        return keypoints, scores, _sample(descriptors, 2.0 * (keypoints + 0.5) / size - 1.0, "bilinear")
 
 
 class XFeatExtractor(nn.Module):

@@ -20,7 +20,7 @@ from sigmaslam_benchmarks.filters.speed import Contender, Timing, time_interleav
 from sigmaslam_benchmarks.matching import check_sets, compare, format_scores, load_extractor
 from sigmaslam_benchmarks.matching.extractors import CLASSICAL, MAX_KEYPOINTS
 from sigmaslam_benchmarks.matching.sets import ALL
-from sigmaslam_benchmarks.tracking.page import check_names, fill_page, write_page
+from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 
 ROUNDS = 15
 """At least so many rounds, in each of which every extractor is timed."""
@@ -58,7 +58,6 @@ def write_features(
     command: str,
     sets: Sequence[str] = ALL,
     rounds: int = ROUNDS,
-    exchange: bool = False,
     note: Callable[[str], None] = lambda text: None,
 ) -> str:
     """Times and scores everyone, writes the page, and the scores beside it as .json; returns the page.
@@ -70,18 +69,9 @@ def write_features(
         peers: .onnx graphs of other people.
         sets: to be scored.
         rounds: of timing.
-        exchange: the page of `matching.exchange` instead; of peers it takes a checkout of EdgePoint2.
     Raises:
         InputError: a file or set cannot be used.
     """
-    if exchange:
-        from sigmaslam_benchmarks.matching.exchange import SETS, write_exchange
-
-        chosen = tuple(SETS) if sets is ALL else sets
-        check_names("set", chosen, tuple(SETS))
-        if len(peers) > 1 or (peers and not peers[0].is_dir()):
-            raise InputError("with --exchange --peer is one folder: a checkout of EdgePoint2")
-        return write_exchange(path, data, command, weights, peers[0] if peers else None, chosen)
     names = [str(_features_of(each)) for each in weights or [shipped_weights("features.onnx")]]
     names += [*CLASSICAL, *map(str, peers)]
     if len(set(names)) < len(names):
