@@ -38,8 +38,6 @@ _BASELINES = (0.01, 0.12)  # of stereo pairs, in median depths, drawn evenly in 
 _ADVANCES = (0.02, 0.35)  # of forward motion, likewise
 _DRIFT, _TURN = 0.1, 1.0  # its standard deviations: of sideways motion, in advances, and of rotation, degrees
 _LATER = (0.1, 0.5)  # seconds between its views
-_ORBIT = 30.0  # degrees to either side, of wide pairs about what is seen: 60 together are a median depth aside
-_NEARER, _AIM = 0.25, 4.0  # logarithm of the distance's change to either side; standard deviation of the aim, degrees
 _EXPOSURE = 0.05  # standard deviation of the logarithm of their exposures' quotient
 
 
@@ -72,7 +70,6 @@ class ScenePairs:
         stereo: the two views are the eyes of a rectified stereo pair, through sensors of one kind.
         max_moving_share: share of the image that may move on its own in a scene.
         forward: the two views are of one camera that advances or retreats, as a car's or a drone's.
-        wide: the views look at the same place from directions up to 60 degrees apart.
     """
 
     def __init__(
@@ -83,15 +80,14 @@ class ScenePairs:
         stereo: bool = False,
         max_moving_share: float = _MAX_MOVING_SHARE,
         forward: bool = False,
-        wide: bool = False,
     ) -> None:
         if not domains:
             raise ValueError(f"there are no domains; give one or more of {', '.join(DOMAINS)}")
         self._generators = {domain: _generator(domain) for domain in domains}
-        if stereo + forward + wide > 1:
-            raise ValueError("pairs are of one kind: give one of stereo, forward and wide")
+        if stereo and forward:
+            raise ValueError("pairs are of one kind: give stereo or forward")
         self.seed, self.size, self.domains, self.stereo, self.forward = seed, size, domains, stereo, forward
-        self._max_moving_share, self._wide = max_moving_share, wide
+        self._max_moving_share = max_moving_share
         self._uses = _VIEWS if forward else _USES
         self._kept: OrderedDict[int, list[RenderedViews]] = OrderedDict()
 
@@ -147,8 +143,7 @@ class ScenePairs:
             T = episode.path.poses(time)
             if k:
                 # From the first view's depth it is known how far aside one can step.
-                step = _go_around if self._wide else _step_aside
-                T = T @ step(rng, _median_depth(result[0]))
+                T = T @ _step_aside(rng, _median_depth(result[0]))
             focal = self.size * np.exp(rng.uniform(np.log(0.6), np.log(1.3)))
             centre = (self.size - 1) / 2
             eye = Eye(CameraModel(self.size, self.size, focal, focal, centre, centre))
@@ -231,13 +226,3 @@ def _step_aside(rng: np.random.Generator, depth: float) -> np.ndarray:
     turn[2] += np.deg2rad(rng.uniform(-40.0, 40.0)) if rng.random() < 0.4 else 0.0
     step = depth * rng.uniform(0.0, 0.08) * rng.standard_normal(3) * np.array([1.0, 0.5, 0.5])
     return rigid_motion(Rotation.from_rotvec(turn).as_matrix(), step)
-
-
-def _go_around(rng: np.random.Generator, depth: float) -> np.ndarray:
-    """Motion of a camera about the place that it looks at, (4, 4): mostly sideways, at nearly the same distance."""
-    place = np.array([0.0, 0.0, depth])
-    turn = np.deg2rad(_ORBIT) * rng.uniform(-1.0, 1.0) * np.array([0.3 * rng.standard_normal(), 1.0, 0.0])
-    R = Rotation.from_rotvec(turn)
-    aim = Rotation.from_rotvec(np.deg2rad(_AIM) * rng.standard_normal(3))
-    distance = np.exp(_NEARER * rng.uniform(-1.0, 1.0))
-    return rigid_motion((R * aim).as_matrix(), place - R.apply(distance * place))
