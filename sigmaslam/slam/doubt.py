@@ -31,12 +31,14 @@ class Doubts:
         spread: (6, 6) by what they make the pose that is published less certain, perturbed from the left in the world.
         prediction_is_wrong: it was made less certain, so that the same matches give another pose.
         is_ambiguous: another pose explains the image about as well.
+        spoils_keyframe: it is that, or nearer landmarks, which may move, draw the pose away from that of the others.
     """
 
     reasons: list[Doubt] = field(default_factory=list)
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     prediction_is_wrong: bool = False
     is_ambiguous: bool = False
+    spoils_keyframe: bool = False
 
     def add(self, reason: Doubt, error: np.ndarray | None = None) -> None:
         """One more; `error` (6,) is how far off the pose is if it is right, as `spread` is perturbed."""
@@ -48,7 +50,7 @@ class Doubts:
     def add_motion(self, pose: np.ndarray, other: np.ndarray) -> None:
         """Two poses (4, 4), T_world_camera, explain the image about as well."""
         self.add(Doubt.MOTIONS, se3_log(pose @ se3_inverse(other)))
-        self.is_ambiguous = True
+        self.is_ambiguous = self.spoils_keyframe = True
 
     @property
     def status(self) -> str:

@@ -114,7 +114,7 @@ class Mapper:
         blur: float,
         matches: GuidedMatches,
         expected: tuple[np.ndarray, np.ndarray],
-        is_ambiguous: bool = False,
+        is_spoilt: bool = False,
     ) -> KeyframeTracks | None:
         """Makes a tracked frame a keyframe when the landmarks of the last one fade, and the frame can replace it.
 
@@ -125,7 +125,7 @@ class Mapper:
             blur: of its image, as of `Keyframes.blur`.
             matches: with the window's landmarks.
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
-            is_ambiguous: another pose explains the frame about as well.
+            is_spoilt: something that moves may have drawn the pose.
         """
         self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
         self._last_count = fit.count
@@ -134,9 +134,9 @@ class Mapper:
             if len(self.window) == self.config.window:
                 self.keyframes.active[0].prepare_to_leave()
             return None
-        # A blurred or ambiguous keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
+        # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
-        is_bad = is_ambiguous or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
+        is_bad = is_spoilt or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
         if share >= ACCEPTANCE.bad_keyframe_landmarks and (is_bad or is_blurred(frame.left)):
             return None
         view = frame.view

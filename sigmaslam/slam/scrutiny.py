@@ -64,8 +64,7 @@ class Scrutiny:
         for region in (moving, self._rival):
             if region is not None:
                 region.carry(left, fit.pose, self._window.camera)
-        second, drawn_by = (None, np.zeros(6)) if moving is None else find_scene_behind(self._localiser, matches, fit)
-        doubts.spread = np.outer(drawn_by, drawn_by)
+        second = None if moving is None else find_scene_behind(self._localiser, matches, fit, doubts)
         second = second or find_second_motion(self._window, matches, fit, moving)
         for _ in range(_MOST_MOVERS):
             if moving is None or second is None or not second.is_mover:

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
-from sigmaslam.estimation.chi_square import CHI_SQUARE_99_OF_6, CHI_SQUARE_9999_OF_6
+from sigmaslam.estimation.chi_square import CHI_SQUARE_95, CHI_SQUARE_99_OF_6, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.mahalanobis import quantiles
 from sigmaslam.estimation.prediction_errors import surprise
 from sigmaslam.geometry.image_cells import explained_area, image_cells
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
+from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
@@ -107,16 +108,15 @@ def find_second_motion(
 
 
 def find_scene_behind(
-    localiser: Localiser, matches: GuidedMatches, fit: FrameFit
-) -> tuple[SecondMotion | None, np.ndarray]:
+    localiser: Localiser, matches: GuidedMatches, fit: FrameFit, doubts: Doubts
+) -> SecondMotion | None:
     """What moves before farther landmarks, and their pose; None where nearer ones agree with that.
 
     Far parts hardly tell a translation: a body before them decides it, and all agree. The scores show it to first
     order; only where they do the pose of the others is found, which costs as much as another fit.
 
-    Returns:
-        The motion, and (6,) by how much nearer landmarks draw the pose along where they may move, but too little to be
-        told from what rests; perturbed from the left in the world, zero where they do not.
+    Where nearer landmarks may move, but too little to be told from what rests, `doubts` takes the step that they draw
+    the pose by. One that 95 % of the others' errors do not reach leaves the pose as uncertain as they know it.
     """
     window, views = localiser.window, matches.views
     rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
@@ -126,7 +126,7 @@ def find_scene_behind(
         prediction = Prediction(prediction.pose, excess * prediction.covariance)
         fit = localiser.fit_again(matches, fit, prediction)
     disparity = window.landmarks.estimate[rows, 2]
-    drawn_by, most = np.zeros(6), 0.0
+    most = 0.0
     for least in quantiles(disparity[fit.inliers], _FARTHER):
         near = disparity > least
         drawn, rest = near & fit.inliers, fit.scores[fit.inliers & ~near]
@@ -137,9 +137,12 @@ def find_scene_behind(
         far = localiser.fit_near(others, prediction)
         if far is None:
             continue
-        squared = _squared_departure(far, fit)
+        step, common = se3_log(far.pose @ se3_inverse(fit.pose)), far.joint.common[-6:] - fit.joint.common[-6:]
+        own = max(far.nis_before_scaling, 1.0) * far.clustering * far.relative
+        squared = Prediction(fit.pose, own + common @ common.T).squared_departure(far.pose)
         if squared > most:
-            drawn_by, most = se3_log(far.pose @ se3_inverse(fit.pose)), squared
+            most, doubts.spoils_keyframe = squared, bool(squared > CHI_SQUARE_95[6])
+            doubts.spread = np.outer(step, step) + doubts.spoils_keyframe * own
         if squared <= CHI_SQUARE_9999_OF_6:
             continue
         by_fit, by_far = (seen_from(window, rows, each.pose) for each in (fit, far))
@@ -148,16 +151,10 @@ def find_scene_behind(
         moves = np.flatnonzero(drawn & ~are_one_place(np.linalg.norm(departure, axis=1)))
         apart = np.linalg.norm((by_far - by_fit)[drawn, :2], axis=1)
         if len(moves) >= MIN_POINTS and not see_the_same(apart):
+            doubts.spread, doubts.spoils_keyframe = np.zeros((6, 6)), False
             far = replace(far, inliers=_among(np.flatnonzero(~near)[far.inliers], len(rows)))
-            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True), np.zeros(6)
-    return None, drawn_by
-
-
-def _squared_departure(part: FrameFit, fit: FrameFit) -> float:
-    """Squared sigmas by which the pose of a part of the matches departs from that of all, by its own errors."""
-    common = part.joint.common[-6:] - fit.joint.common[-6:]
-    spread = max(part.nis_before_scaling, 1.0) * part.clustering * part.relative + common @ common.T
-    return Prediction(fit.pose, spread).squared_departure(part.pose)
+            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True)
+    return None
 
 
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.prediction_errors import surprise
 from sigmaslam.geometry.image_cells import explained_area
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, transform_points
+from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Localiser
 from sigmaslam.slam.moving_region import MovingRegion
@@ -77,19 +78,21 @@ def scene(seed: int, way: list[float], sigma: float = 0.2) -> tuple[Localiser, G
 def test_a_body_before_the_scene_that_draws_the_pose_along_is_found(seed: int) -> None:
     """All agree with a pose between both motions."""
     localiser, matches, fit = scene(seed, [-0.02, 0.0, 0.0])
-    second, _ = find_scene_behind(localiser, matches, fit)
+    second = find_scene_behind(localiser, matches, fit, doubts := Doubts())
     assert second is not None
     assert second.is_mover
     assert np.mean(second.agreeing >= FAR) > 0.95
     errors = [np.linalg.norm((se3_inverse(POSE) @ each.pose)[:3, 3]) for each in (fit, second.first)]
     assert errors[1] < 0.2 * errors[0]
+    assert not doubts.spoils_keyframe
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_body_at_rest_before_the_scene_is_none_that_moves(seed: int) -> None:
-    second, drawn_by = find_scene_behind(*scene(seed, [0.0, 0.0, 0.0]))
+    second = find_scene_behind(*scene(seed, [0.0, 0.0, 0.0]), doubts := Doubts())
     assert second is None
-    assert not drawn_by.any()
+    assert not doubts.spread.any()
+    assert not doubts.spoils_keyframe
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -97,7 +100,7 @@ def test_far_parts_do_not_side_with_a_prediction_that_the_image_contradicts(seed
     """As after a frame that was lost unnoticed, at twice the speed: near points at rest would seem to move."""
     localiser, matches, fit = scene(seed, [0.0, 0.0, 0.0], sigma=0.001)
     assert surprise(localiser.motion, fit.pose) > 5.0
-    assert find_scene_behind(localiser, matches, fit)[0] is None
+    assert find_scene_behind(localiser, matches, fit, Doubts()) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -111,3 +114,16 @@ def test_a_body_that_moves_by_too_little_to_be_told_is_in_the_covariance(seed: i
     error = se3_log(POSE @ se3_inverse(fit.pose))
     assert squared_mahalanobis(error[None], fit.relative[None])[0] > 50.0
     assert squared_mahalanobis(error[None], (fit.relative + doubts.spread)[None])[0] < 22.5
+
+
+def test_a_pose_that_a_body_draws_far_along_is_as_uncertain_as_the_others_know_it() -> None:
+    """And it spoils a keyframe: its error would be in all later poses. Two pixels; of one the step says enough."""
+    image, moving = np.zeros((CAMERA.height, CAMERA.width), np.uint8), MovingRegion(8.0, 10)
+    for way, spoils, most in ((-0.008, True, 2.0), (-0.004, False, 8.0)):
+        localiser, matches, fit = scene(2, [way, 0.0, 0.0])
+        _, same, doubts = Scrutiny(localiser, FrameClock(), moving, False).doubt(image, matches, fit)
+        assert same is fit
+        assert doubts.spoils_keyframe == spoils
+        assert doubts.status == "tracking"
+        error = se3_log(POSE @ se3_inverse(fit.pose))
+        assert squared_mahalanobis(error[None], (fit.relative + doubts.spread)[None])[0] < most
