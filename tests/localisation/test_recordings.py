@@ -87,6 +87,13 @@ def test_without_noise_a_recording_has_no_residuals(tmp_path):
         ("sightings.csv", "time,landmark,range,bearing\n0.1,1,-1,0\n", "a range is not positive"),
         ("sightings.csv", "time,landmark,range,bearing\n0.1,99,1,0\n", "landmark 99 is not in landmarks.csv"),
         ("controls.csv", "time,speed,turn_rate\n0,one,0\n", "line 2"),
+        ("controls.csv", "time,speed,turn_rate\n0,1,0\n1,nan,0\n", "line 3 .* not finite"),
+        (
+            "sightings.csv",
+            "time,landmark,range,bearing\n0.1,1,1,57.3\n",
+            "a bearing is 57.3, beyond a turn: give rad",
+        ),
+        ("sightings.csv", "time,landmark,range,bearing\n1.7e9,1,1,0\n", "1.7e.09 s off the controls: give both by one"),
         ("sightings.csv", "time,landmark,a,b\n", "ahead,left"),
         ("controls.csv", "time,speed,turn_rate\n", "has no rows"),
     ],
