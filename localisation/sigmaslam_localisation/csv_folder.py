@@ -13,7 +13,7 @@ LONGEST_GAP = 0.5
 """Seconds between poses of the truth above which nothing is interpolated."""
 
 LONGEST_SILENCE = 3600.0
-"""Seconds by which sightings may come before the first control or after the last."""
+"""Seconds between the first or last sighting and the first or last control."""
 
 
 def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True) -> Recording:
@@ -50,11 +50,9 @@ def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True
         raise InputError(f"{path}: a range is not positive")
     if kind == "range-bearing" and (largest := np.abs(sightings[:, 2]).max()) > 2 * np.pi:
         raise InputError(f"{path}: a bearing is {largest:.4g}, beyond a turn: give radians")
-    early, late = controls[:, 0].min() - sightings[:, 0].min(), sightings[:, 0].max() - controls[:, 0].max()
-    if max(early, late) > LONGEST_SILENCE:
-        raise InputError(
-            f"{path}: a sighting is {max(early, late):.4g} s off the controls: give both by one clock, seconds"
-        )
+    ends = [(each[:, 0].min(), each[:, 0].max()) for each in (controls, sightings)]
+    if (apart := float(np.abs(np.subtract(*ends)).max())) > LONGEST_SILENCE:
+        raise InputError(f"{path}: sightings begin or end {apart:.4g} s off the controls: give one clock, seconds")
     unknown = sorted(set(seen) - set(names))
     if unknown and not mapping:
         raise InputError(
