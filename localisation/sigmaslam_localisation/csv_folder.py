@@ -50,8 +50,8 @@ def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True
         raise InputError(f"{path}: a range is not positive")
     if kind == "range-bearing" and (largest := np.abs(sightings[:, 2]).max()) > 2 * np.pi:
         raise InputError(f"{path}: a bearing is {largest:.4g}, beyond a turn: give radians")
-    ends = [(each[:, 0].min(), each[:, 0].max()) for each in (controls, sightings)]
-    if (apart := float(np.abs(np.subtract(*ends)).max())) > LONGEST_SILENCE:
+    first, last = ([end(each[:, 0]) for each in (controls, sightings)] for end in (np.min, np.max))
+    if (apart := max(abs(first[0] - first[1]), abs(last[0] - last[1]))) > LONGEST_SILENCE:
         raise InputError(f"{path}: sightings begin or end {apart:.4g} s off the controls: give one clock, seconds")
     unknown = sorted(set(seen) - set(names))
     if unknown and not mapping:
