@@ -27,9 +27,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     Yields:
         The path to write to inside the block.
     Raises:
-        InputError: the folder does not exist or cannot be written.
+        InputError: the folder does not exist or cannot be written, or `path` is a folder.
     """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder: give the name of a file in it")
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(6)}{path.suffix}")
     try:
         temporary.touch(exist_ok=False)

@@ -260,7 +260,11 @@ class BayesFilter(SequenceFilter):
         if healthy is None:
             return result
         if self.on_failure == "raise":
-            raise_unless_healthy(healthy, stage, {"prior covariance": lambda: before.covariance, **suspects})
+            prior: dict[str, Callable[[], Tensor]] = {
+                "prior mean": lambda: torch.diag_embed(torch.where(before.mean.isfinite(), 1.0, before.mean)),
+                "prior covariance": lambda: before.covariance,
+            }
+            raise_unless_healthy(healthy, stage, prior | dict(suspects))
             return result
         return result.where(healthy, before)
 

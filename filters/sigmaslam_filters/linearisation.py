@@ -250,13 +250,8 @@ class Linearisation:
 
         def error(mask: Tensor | None, noise: Noise) -> Tensor:
             variance = noise.variance() if measurement.additive else columns.odd[..., size:].square().sum(dim=-1)
-            return _linearisation_error(even, variance, mask)
+            # Where there is no noise, no error is small.
+            share = (even * even).sum(dim=-1) / variance.clamp_min(torch.finfo(variance.dtype).tiny)
+            return (share if mask is None else torch.where(mask, share, 0.0)).sum(dim=-1)
 
         return error
-
-
-def _linearisation_error(even: Tensor, variance: Tensor, mask: Tensor | None) -> Tensor:
-    """Expected square of what sigma points see of the linearisation's error, (...,), over the noise's variance."""
-    # Where there is no noise, no error is small.
-    share = (even * even).sum(dim=-1) / variance.clamp_min(torch.finfo(variance.dtype).tiny)
-    return (share if mask is None else torch.where(mask, share, 0.0)).sum(dim=-1)

@@ -155,10 +155,11 @@ def range_and_bearing(noise: Noise | Tensor) -> MeasurementModel:
         x, y = landmark[..., 0] - state[..., 0], landmark[..., 1] - state[..., 1]
         return stack([torch.hypot(x, y), wrap_angle(torch.atan2(y, x) - state[..., 2])])
 
-    return MeasurementModel(see, noise, residual=_range_and_bearing_residual)
+    return MeasurementModel(see, noise, residual=range_and_bearing_residual)
 
 
-def _range_and_bearing_residual(measured: Tensor, predicted: Tensor) -> Tensor:
+def range_and_bearing_residual(measured: Tensor, predicted: Tensor) -> Tensor:
+    """Of a range and a bearing (..., 2): the difference, its angle in (-pi, pi]."""
     difference = measured - predicted
     return stack([difference[..., 0], wrap_angle(difference[..., 1])])
 

@@ -12,6 +12,9 @@ KINDS = {"range-bearing": ["range", "bearing"], "cartesian": ["ahead", "left"]}
 LONGEST_GAP = 0.5
 """Seconds between poses of the truth above which nothing is interpolated."""
 
+LONGEST_SILENCE = 3600.0
+"""Seconds between the first or last sighting and the first or last control."""
+
 
 def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True) -> Recording:
     """One robot's recording.
@@ -45,6 +48,11 @@ def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True
         raise InputError(f"{folder / 'landmarks.csv'}: a landmark stands twice")
     if kind == "range-bearing" and (sightings[:, 1] <= 0.0).any():
         raise InputError(f"{path}: a range is not positive")
+    if kind == "range-bearing" and (largest := np.abs(sightings[:, 2]).max()) > 2 * np.pi:
+        raise InputError(f"{path}: a bearing is {largest:.4g}, beyond a turn: give radians")
+    first, last = ([end(each[:, 0]) for each in (controls, sightings)] for end in (np.min, np.max))
+    if (apart := max(abs(first[0] - first[1]), abs(last[0] - last[1]))) > LONGEST_SILENCE:
+        raise InputError(f"{path}: sightings begin or end {apart:.4g} s off the controls: give one clock, seconds")
     unknown = sorted(set(seen) - set(names))
     if unknown and not mapping:
         raise InputError(
@@ -96,11 +104,13 @@ def _read(path: Path, columns: list[str], named: int | None = None) -> tuple[lis
                 if len(row) != len(columns):
                     raise ValueError(f"{len(row)} columns")
                 numbers.append([float(cell) for column, cell in enumerate(row) if column != named])
+                if not np.isfinite(numbers[-1]).all():
+                    raise ValueError("a number that is not finite")
             except ValueError as error:
                 raise InputError(f"{path}: line {line} is not {','.join(columns)} ({error})") from error
             if named is not None:
                 names.append(row[named].strip())
     table = np.array(numbers).reshape(len(numbers), len(columns) - (named is not None))
-    if not len(table) or not np.isfinite(table).all():
-        raise InputError(f"{path}: has no rows, or a number that is not finite")
+    if not len(table):
+        raise InputError(f"{path}: has no rows")
     return names, table

@@ -77,7 +77,9 @@ class RobotStep:
         noisy = replace(see, noise=Diagonal((expected * growth[..., None]).flatten(-2)))
         updated = self.bayes.update(belief, noisy, value.flatten(-2), position, robust="student_t")
         sighted = _compare(updated, expected, growth, there)
-        log_likelihood = torch.where(there, _log_student(sighted, m) / growth, 0.0).sum(dim=-1)
+        student = 0.5 * (STUDENT_DOF + m) * torch.log1p(sighted.distance / STUDENT_DOF)
+        density = -0.5 * sighted.log_determinant - student
+        log_likelihood = torch.where(there, density / growth, 0.0).sum(dim=-1)
         predicted = (torch.diagonal(sighted.covariance, dim1=-2, dim2=-1) - expected).clamp_min(0.0)
         learned = noise.learn(sighted.innovation, predicted, expected, sighted.weight / growth, there)
         return updated.belief, learned.scale, sighted.distance, sighted.weight, sighted.innovation, log_likelihood
@@ -103,10 +105,3 @@ def _compare(updated: Update, expected: Tensor, growth: Tensor, there: Tensor) -
     factor = cholesky(covariance)[0]
     distance = solve_lower(factor, innovation[..., None]).square().sum(dim=(-2, -1))
     return _Sighted(innovation, covariance, log_diagonal(factor), distance, weight)
-
-
-def _log_student(sighted: _Sighted, components: int) -> Tensor:
-    """Log-density (B, L) of innovations, but for a constant."""
-    return -0.5 * sighted.log_determinant - 0.5 * (STUDENT_DOF + components) * torch.log1p(
-        sighted.distance / STUDENT_DOF
-    )

@@ -19,17 +19,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sigmaslam_filters import (
-    SE2,
-    Diagonal,
-    Euclidean,
-    Gaussian,
-    MeasurementModel,
-    MotionModel,
-    Product,
-    stack,
-    wrap_angle,
-)
+from sigmaslam_filters import SE2, Diagonal, Euclidean, Gaussian, MeasurementModel, MotionModel, Product, stack
+from sigmaslam_filters.systems import range_and_bearing_residual
 from sigmaslam_localisation.recording import Recording
 
 BODY = SE2("right")
@@ -103,7 +94,7 @@ class WheeledRobot:
         unit = Diagonal(torch.ones(2, dtype=torch.float64))
         if self.kind == "cartesian":
             return MeasurementModel(self._seen_at, unit)
-        return MeasurementModel(self._distance_and_bearing, unit, residual=_wrapped_difference)
+        return MeasurementModel(self._distance_and_bearing, unit, residual=range_and_bearing_residual)
 
     def variance(self, value: Tensor) -> Tensor:
         """Variances (..., 2) of sightings (..., 2), from the distance that was measured."""
@@ -149,8 +140,3 @@ def _drive(state: Tensor, noise: Tensor, path: Tensor, duration: Tensor) -> Tens
     drift = state[..., 7]
     moved = BODY.retract(state[..., :3], stack([distance * torch.cos(drift), distance * torch.sin(drift), turn]))
     return stack([*moved.unbind(-1), *state[..., 3:].unbind(-1)])
-
-
-def _wrapped_difference(measured: Tensor, predicted: Tensor) -> Tensor:
-    difference = measured - predicted
-    return stack([difference[..., 0], wrap_angle(difference[..., 1])])

@@ -1,8 +1,9 @@
 """A module as an ONNX graph: written, and compared with torch on inputs of other sizes than it was traced with."""
 
+import contextlib
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.errors import SigmaSlamError
+from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_path
 from sigmaslam.inference.onnx_graph import OnnxGraph
 from sigmaslam_filters.graphs.graph_file import simplify, strip_origins
@@ -39,13 +40,28 @@ class TracedModule:
     dynamic: tuple[Any, ...]
 
 
-def export_graph(graph: TracedModule, out: Path, tolerance: float, compare: Compare | None = None) -> float:
+def export_graph(
+    graph: TracedModule,
+    out: Path,
+    tolerance: float,
+    compare: Compare | None = None,
+    draft: Callable[[Path], None] | None = None,
+) -> float:
     """Writes a graph and returns its difference from torch.
+
+    Args:
+        draft: writes what may be the graph already; it is traced, for minutes, only where that is another one.
 
     Raises:
         SigmaSlamError: it is larger than the tolerance. Nothing is written.
     """
     with warnings.catch_warnings(), atomic_path(out) as path:
+        if draft is not None:
+            with contextlib.suppress(InputError, ValueError):
+                draft(path)
+                difference = graph_difference(graph, path, compare or relative_difference)
+                if difference <= tolerance:
+                    return difference
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         program = torch.onnx.export(
@@ -70,6 +86,20 @@ def export_graph(graph: TracedModule, out: Path, tolerance: float, compare: Comp
                 f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
             )
     return difference
+
+
+def exchange_weights(graph: Path, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], out: Path) -> None:
+    """Writes a graph with the weights `new` in place of those that it has by name, or transposed by value of `old`."""
+    import onnx  # the package loads it only to write a graph
+
+    model = onnx.load(graph)
+    transposed = {weight.T.tobytes(): name for name, weight in old.items() if weight.ndim == 2}
+    for constant in model.graph.initializer:
+        value, name = onnx.numpy_helper.to_array(constant), constant.name.partition(".")[2]
+        weight = new.get(name) if name in old else new.get(transposed.get(value.tobytes(), ""), np.empty(0)).T
+        if weight is not None and weight.shape == value.shape:
+            constant.CopyFrom(onnx.numpy_helper.from_array(np.ascontiguousarray(weight), constant.name))
+    onnx.save(model, out)
 
 
 def graph_difference(graph: TracedModule, path: Path, compare: Compare) -> float:

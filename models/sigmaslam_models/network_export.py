@@ -1,21 +1,25 @@
 """The trained networks: read from their weights, and exported to ONNX."""
 
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
 from safetensors import SafetensorError
+from safetensors.numpy import load_file as read_arrays
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_bytes, atomic_write_text, make_folder
+from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam_models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam_models.feature_network import FeatureNetwork
-from sigmaslam_models.graph_export import TracedModule, export_graph
+from sigmaslam_models.graph_export import TracedModule, exchange_weights, export_graph
 from sigmaslam_models.model_card import read_card, scoring_page
 from sigmaslam_models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam_models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchCovariance, MatchVerifier
@@ -50,7 +54,8 @@ def load_verifier(weights: Path, columns: int = VERIFIER_COLUMNS) -> MatchVerifi
 
 def export_features(weights: Path, out: Path) -> float:
     """Writes the feature graph and returns the largest difference from torch, in pixels where there are any."""
-    return export_graph(_feature_graph(load_network(weights)), out, NETWORK_TOLERANCE, feature_difference)
+    graph, draft = _feature_graph(load_network(weights)), _with_weights("features", weights)
+    return export_graph(graph, out, NETWORK_TOLERANCE, feature_difference, draft)
 
 
 def export_scoring(run: Path, out: Path) -> dict[str, float]:
@@ -69,12 +74,15 @@ def export_scoring(run: Path, out: Path) -> dict[str, float]:
         load_verifier(run / "verifier.safetensors"),
         load_verifier(run / "place_verifier.safetensors", PLACE_COLUMNS),
     )
-    differences = {name: export_graph(graph, out / f"{name}.onnx", NETWORK_TOLERANCE) for name, graph in graphs.items()}
+    differences = {
+        name: export_graph(
+            graph, out / f"{name}.onnx", NETWORK_TOLERANCE, draft=_with_weights(name, run / f"{name}.safetensors")
+        )
+        for name, graph in graphs.items()
+    }
     content["onnx_minus_torch"] = differences
     for name in graphs:
-        copied = (run / f"{name}.safetensors").read_bytes()
-        with atomic_path(out / f"{name}.safetensors") as path:
-            path.write_bytes(copied)
+        atomic_write_bytes(out / f"{name}.safetensors", (run / f"{name}.safetensors").read_bytes())
     atomic_write_text(out / "matching.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "matching.md", scoring_page(content))
     update_manifest(out, [f"{name}{suffix}" for name in graphs for suffix in (".onnx", ".safetensors")])
@@ -109,6 +117,12 @@ def feature_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> 
     return max(
         float(np.abs(a[nearest[common]] - b[:count][common]).max()) for a, b in zip(actual, expected, strict=True)
     )
+
+
+def _with_weights(name: str, weights: Path) -> Callable[[Path], None]:
+    """Writes the graph of this name that ships, with other weights."""
+    shipped = shipped_weights(f"{name}.safetensors")
+    return partial(exchange_weights, shipped.with_suffix(".onnx"), read_arrays(shipped), read_arrays(weights))
 
 
 def _feature_graph(network: FeatureNetwork) -> TracedModule:

@@ -1,41 +1,40 @@
-"""A folder of what the runtime needs: all graphs, exported to it and compared with torch."""
+"""What a training run exports, and the graphs of a folder compared with torch."""
 
 import json
 from pathlib import Path
 
 from sigmaslam.errors import InputError, SigmaSlamError
-from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_bytes, atomic_write_text, make_folder
 from sigmaslam.inference.weight_manifest import update_manifest
-from sigmaslam_models.estimator.estimator_export import ESTIMATOR_TOLERANCE, estimator_graphs, export_estimator
+from sigmaslam_models.estimator.estimator_export import ESTIMATOR_TOLERANCE, estimator_graphs
 from sigmaslam_models.graph_export import graph_difference, relative_difference
 from sigmaslam_models.model_card import card_page, read_card
 from sigmaslam_models.network_export import NETWORK_TOLERANCE, export_features, feature_difference, network_graphs
 
 
-def export_all(
+def export_run(
     weights: Path, card: Path, out: Path, scores: dict[str, dict[str, float]] | None = None
 ) -> dict[str, float]:
-    """Everything the runtime needs, into one folder: graphs, weights and card.
+    """Graph, weights and card of a run of `sigmaslam train`, into one folder; the estimator's graphs hold no weights.
 
     Args:
         weights: safetensors file of a training run.
-        card: its JSON card; the differences found here are added to the copy in `out`.
+        card: its JSON card; the difference found here is added to the copy in `out`.
         scores: of these weights on real sets, by set, for the card.
-        out: folder that gets features.onnx, the estimator's graphs, features.safetensors, and features.json and .md.
+        out: folder that gets features.onnx, features.safetensors, and features.json and .md.
+    Returns:
+        Largest difference of the graph from torch.
     """
     content = read_card(card)
     if scores is not None:
         content["metrics_on_real_sets"] = scores
     make_folder(out)
-    differences = {"features": export_features(weights, out / "features.onnx"), **export_estimator(out)}
-    content["onnx_minus_torch"] = differences
-    copied = weights.read_bytes()
-    with atomic_path(out / "features.safetensors") as path:
-        path.write_bytes(copied)
+    content["onnx_minus_torch"] = {"features": export_features(weights, out / "features.onnx")}
+    atomic_write_bytes(out / "features.safetensors", weights.read_bytes())
     atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
     atomic_write_text(out / "features.md", card_page(content))
     update_manifest(out, ["features.safetensors", "features.onnx"])
-    return differences
+    return content["onnx_minus_torch"]
 
 
 def check_graphs(folder: Path) -> dict[str, float]:
@@ -62,6 +61,6 @@ def check_graphs(folder: Path) -> dict[str, float]:
         if not differences[name] <= tolerance:
             raise SigmaSlamError(
                 f"{folder / name}.onnx differs from torch by {differences[name]:.2e}, more than {tolerance:.0e}: "
-                "export it again with `sigmaslam train export`"
+                "reinstall the package, or export it again"
             )
     return differences

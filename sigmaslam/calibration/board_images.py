@@ -61,9 +61,11 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
         kinds = [_moments(files, names, kind) for kind in range(len(names[0].moments))]
         moments = max(kinds, key=lambda each: sum(all(eyes) for eyes in each.values()))
         if any(all(eyes) for eyes in moments.values()):
+            # 2 comes before 10.
+            order = sorted(moments, key=lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), name))
             return [
-                BoardImages(" + ".join(file.name for file in eyes if file), tuple(eyes))
-                for _, eyes in sorted(moments.items(), key=lambda moment: _by_number(moment[0]))
+                BoardImages(" + ".join(file.name for file in moments[name] if file), tuple(moments[name]))
+                for name in order
             ]
         alone.append([next(f for f, n in zip(files, names, strict=True) if n.eye == k) for k in (0, 1)])
     if alone:
@@ -156,8 +158,3 @@ def _files_inside(folder: Path) -> list[Path]:
         return _files_of(folder)
     except InputError:
         return []
-
-
-def _by_number(name: str) -> str:
-    """A key that sorts 2 before 10."""
-    return re.sub(r"\d+", lambda digits: digits[0].zfill(20), name)

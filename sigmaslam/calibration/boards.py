@@ -168,7 +168,7 @@ def parse_board(text: str) -> Board:
     try:
         columns, rows = (int(number) for number in parts[0].split("x"))
         sizes = [float(number) for number in parts[1:3]]
-        if min(columns, rows) < 2 or not sizes or not all(np.isfinite(size) and size > 0.0 for size in sizes):
+        if min(columns, rows) < 2 or not sizes or not all(0.0 < size < 10.0 for size in sizes):
             raise ValueError
         if kind == "chessboard" and len(parts) == 2:
             return Chessboard(columns, rows, sizes[0])

@@ -122,7 +122,8 @@ def draw_board_calibration(path: Path, result: BoardCalibration) -> None:
         mine = result.corners.eye == k
         images = result.corners.image[mine]
         squared = np.bincount(images, np.sum(result.residuals[mine] ** 2, axis=1), len(result.names))
-        grid[1, k].bar(range(len(result.names)), np.sqrt(squared / np.maximum(np.bincount(images), 1)), color=BLUE)
+        counts = np.maximum(np.bincount(images, minlength=len(result.names)), 1)
+        grid[1, k].bar(range(len(result.names)), np.sqrt(squared / counts), color=BLUE)
         style_axes(grid[1, k])
         grid[1, k].set(ylabel="rms, px", xticks=range(len(result.names)))
         grid[1, k].set_xticklabels([each.split(" + ")[0] for each in result.names], rotation=90, fontsize=7)

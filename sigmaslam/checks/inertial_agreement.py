@@ -110,17 +110,14 @@ def _liveliest(timestamps: np.ndarray, recording: InertialRecording) -> int:
 def _nearest_axes(off: np.ndarray, fit: TurnFit) -> np.ndarray | None:
     """The signed axes that a gyro has instead of the expected ones; None where it is turned by another angle."""
     right = np.linalg.det(off) > 0.0
-    if right and _is_zero(rotation_log(off), fit):
+    turn, covariance = rotation_log(off), fit.rotation_covariance + _TURN**2 * np.eye(3)
+    # No more than noise and what the tracker allows for.
+    if right and float(turn @ np.linalg.solve(covariance, turn)) < _CHI_SQUARE:
         return np.eye(3)
     candidates = SIGNED_AXES[(np.linalg.det(SIGNED_AXES) > 0.0) == right]
     axes = candidates[np.argmax(np.einsum("kij,ij->k", candidates, off))]
     angle = float(np.linalg.norm(rotation_log(axes.T @ off)))
     return axes if angle < _NEAR and not (right and np.array_equal(axes, np.eye(3))) else None
-
-
-def _is_zero(turn: np.ndarray, fit: TurnFit) -> bool:
-    """Whether a rotation vector (3,) is no more than noise and what the tracker allows for."""
-    return float(turn @ np.linalg.solve(fit.rotation_covariance + _TURN**2 * np.eye(3), turn)) < _CHI_SQUARE
 
 
 def _axes_of_forces(

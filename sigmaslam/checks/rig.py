@@ -208,12 +208,9 @@ def check_pairing(
         f"matches scatter by {scatter[best]:.1f} px with the right image one {'after' if best > 0 else 'before'}, by "
         f"{scatter[0]:.1f} px as given: pair them so, or trigger both cameras together"
     )
-    return Finding(_SYNCHRONISATION, "error", message, lag, abs(lag) * _median_flow(matches))
-
-
-def _median_flow(matches: EyeMatches) -> float:
     followed = matches.flow[np.isfinite(matches.flow).all(axis=1)]
-    return float(np.median(np.linalg.norm(followed, axis=1))) if len(followed) else 0.0
+    flow = float(np.median(np.linalg.norm(followed, axis=1))) if len(followed) else 0.0
+    return Finding(_SYNCHRONISATION, "error", message, lag, abs(lag) * flow)
 
 
 def _milliseconds(lag: float, frame_interval: float | None) -> str:

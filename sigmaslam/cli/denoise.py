@@ -17,11 +17,11 @@ def denoise(
     out: Annotated[Path, typer.Option(help="Folder for the filtered images, new or empty.")],
     sigma: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Standard deviation of the noise, grey levels of 255.", show_default="estimated"),
+        typer.Option(min=0.0, max=255.0, help="Deviation of the noise, grey levels of 255.", show_default="estimated"),
     ] = None,
     gain: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Variance of shot noise per grey level: 255 / photons at white.", show_default="0"),
+        typer.Option(min=0.0, max=255.0, help="Variance of shot noise per grey level: 255 / photons at white."),
     ] = None,
     blur: Annotated[
         float,

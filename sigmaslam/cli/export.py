@@ -25,8 +25,7 @@ def export(
 ) -> None:
     """Export what a run made to ONNX and check the graphs against torch (needs the extra 'train').
 
-    A run of 'train' gives the features' graph and those of the tracker's estimator, a run of 'train-scorer' scorer and
-    verifier.
+    A run of 'train network' gives the features' graph, a run of 'train scorer' scorer and verifiers.
     """
     need_train_extra()
     if check or page is not None:
@@ -38,21 +37,21 @@ def export(
         raise InputError("give the folder of a run and --out, or --check, or --page")
     from sigmaslam_models.model_card import read_scores
     from sigmaslam_models.network_export import export_scoring
-    from sigmaslam_models.onnx_export import export_all
+    from sigmaslam_models.onnx_export import export_run
     from sigmaslam_training.features.loop import WEIGHTS_NAME
     from sigmaslam_training.matching.scoring import SCORER_NAME
     from sigmaslam_training.run_card import CARD_NAME
 
     if (run / SCORER_NAME).is_file():
         if scores is not None:
-            raise InputError(f"--scores is of features, {run} is a run of train-scorer: leave it out")
+            raise InputError(f"--scores is of features, {run} is a run of 'train scorer': leave it out")
         with Console(stderr=True).status("exporting three graphs"):
             differences = export_scoring(run, out)
         _tell_differences(differences)
         return
     on_real_sets = None if scores is None else read_scores(scores)
-    with Console(stderr=True).status("exporting eight graphs (some minutes)"):
-        differences = export_all(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
+    with Console(stderr=True).status("exporting a graph"):
+        differences = export_run(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
     _tell_differences(differences)
 
 

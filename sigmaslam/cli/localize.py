@@ -1,5 +1,6 @@
 """`sigmaslam localize`."""
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -88,8 +89,12 @@ def localize(
                 raise InputError(f"{path}: the filter {name} cannot go on: {error}") from error
             rows += [(name, each, summary) for each, summary in summaries.items()]
     _print_rows(rows)
+    if any(summary.get("nis_per_dof", 0.0) > _MOST_NIS for _, _, summary in rows):
+        typer.echo("sightings contradict controls, start or map: are all in seconds, metres, radians, one world?")
     if compare:
-        _write_rows(out / "comparison.csv", rows)
+        shown = _shown(rows)
+        cells = ([name, each, *(summary.get(label, "") for label in shown)] for name, each, summary in rows)
+        atomic_write_text(out / "comparison.csv", csv_text([["filter", "robot", *shown], *cells]))
         typer.echo(f"Comparison: {out / 'comparison.csv'}")
     else:
         typer.echo(f"Report: {out / 'report.html'}")
@@ -143,11 +148,15 @@ def _localise_body(
 def _parse_pose(text: str) -> tuple[float, float, float]:
     try:
         x, y, heading = (float(part) for part in text.split(","))
+        if not math.isfinite(x + y + heading):
+            raise ValueError("not finite")
     except ValueError as error:
         raise InputError(f"--start {text}: is not X,Y,HEADING, such as 1.5,-0.2,3.14") from error
     return x, y, heading
 
 
+# Noise is learned from the innovations, so theirs is one where models fit.
+_MOST_NIS = 3.0
 _Row = tuple[str, str, dict[str, Any]]
 """Filter, robot and summary."""
 _ERRORS = ("position_rmse", "heading_rmse", "rotation_rmse", "nees_median", "nees_mean")
@@ -176,12 +185,6 @@ def _print_rows(rows: Sequence[_Row]) -> None:
         for label in _shown(rows):
             table.add_row(label.replace("_", " "), *(_cell(summary.get(label)) for summary in robots.values()))
         console.print(table)
-
-
-def _write_rows(path: Path, rows: Sequence[_Row]) -> None:
-    shown = _shown(rows)
-    cells = ([name, robot, *(summary.get(label, "") for label in shown)] for name, robot, summary in rows)
-    atomic_write_text(path, csv_text([["filter", "robot", *shown], *cells]))
 
 
 def _cell(value: Any) -> str:

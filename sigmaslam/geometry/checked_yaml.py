@@ -30,7 +30,8 @@ class CalibrationYaml:
         text = read_text(path, CALIBRATION_BYTES, "the calibration", CalibrationError)
         first, _, body = text.partition("\n")
         if first.startswith("%YAML"):
-            text = "\n" + _without_opencv_syntax(body)
+            # OpenCV tags matrices, and can do without the space between key and list.
+            text = "\n" + re.sub(r"(?m)^(\s*[\w.]+):(?=\[)", r"\1: ", body.replace("!!opencv-matrix", ""))
         entries = parse_yaml(text, path, CalibrationError)
         if not isinstance(entries, dict):
             found = {type(None): "nothing", list: "a list", str: "text"}.get(type(entries), "a single value")
@@ -123,8 +124,3 @@ def _floats(value: Any) -> Any:
     if isinstance(value, str | int | float) and not isinstance(value, bool):
         return float(value)
     raise ValueError
-
-
-def _without_opencv_syntax(text: str) -> str:
-    """The text without the tag of matrices, and with the space between key and list that OpenCV can do without."""
-    return re.sub(r"^(\s*[\w.]+):(?=\[)", r"\1: ", text.replace("!!opencv-matrix", ""), flags=re.MULTILINE)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, load_columns, read_text
+from sigmaslam.bounded_files import TABLE_BYTES, load_columns, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, csv_text
 from sigmaslam.geometry.camera import StereoCamera
@@ -21,6 +21,8 @@ _PIXELS = ("u0", "v0", "u1", "v1")
 _PLACE = ("x", "y", "z")
 # Pixels; good calibrations leave less than one.
 _MOST_MISSED = 3.0
+# Of the distance of control points from their mean: survey errors are far smaller.
+_MOST_OF_SPREAD = 0.1
 _COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 
 
@@ -138,6 +140,7 @@ def orient_files(source: Path, target: Path, out: Path, with_scale: bool, sigma:
         raise InputError(f"{source}: {len(names)} points lie on a line or are too few to tell how well they fit")
     T = rigid_motion(found.scale * found.R, found.translation)
     residuals = np.linalg.norm(found.apply(points) - control, axis=1)
+    rms, apart = np.sqrt(np.mean(residuals**2)), np.sqrt(control.var(axis=0).sum())
     content = {
         "T_target_source": T.tolist(),
         "scale": found.scale,
@@ -148,10 +151,11 @@ def orient_files(source: Path, target: Path, out: Path, with_scale: bool, sigma:
     atomic_write_text(out, json.dumps(content, indent=2) + "\n")
     deviation = np.sqrt(np.diag(found.covariance))
     scale = f"; scale {found.scale:.6g} ± {found.scale * deviation[6]:.2g}" if with_scale else ""
+    doubt = f"residuals of {rms / apart:.0%} of the spread: do ids, units (--scale) and handedness agree?\n"
     return (
-        f"{len(names)} points, residuals rms {np.sqrt(np.mean(residuals**2)):.4g} m, largest {residuals.max():.4g} m "
-        f"of {names[int(residuals.argmax())]}\nsigma     place of the centroid {deviation[:3].max():.2g} m, turn "
-        f"{np.degrees(deviation[3:6].max()):.2g} deg{scale}\nWritten: {out}"
+        f"{doubt if rms > _MOST_OF_SPREAD * apart else ''}{len(names)} points, residuals rms {rms:.4g} m, largest "
+        f"{residuals.max():.4g} m of {names[int(residuals.argmax())]}\nsigma     place of the centroid "
+        f"{deviation[:3].max():.2g} m, turn {np.degrees(deviation[3:6].max()):.2g} deg{scale}\nWritten: {out}"
     )
 
 
@@ -185,7 +189,8 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[list[str], np.nda
     missing = [column for column in columns if column not in (reader.fieldnames or ())]
     if missing:
         raise InputError(
-            f"{path}: no column {missing[0]}: give a header with {','.join(columns)}, and if wanted id and sigma"
+            f"{path}: no column {missing[0]} in '{shorten(','.join(reader.fieldnames or ()))}': give a header with "
+            f"{','.join(columns)}, and if wanted id and sigma"
         )
     names, rows = [], []
     for number, row in enumerate(reader):
@@ -194,9 +199,12 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[list[str], np.nda
             sigma = float(row["sigma"]) if row.get("sigma") else np.nan
         except (TypeError, ValueError):
             values, sigma = [np.nan], np.nan
-        if not np.isfinite(values).all() or sigma <= 0.0:
+        # By None stands what is more than the header has columns, as of decimal commas.
+        if not np.isfinite(values).all() or sigma <= 0.0 or any(row.get(None, ())):
+            cells = shorten(",".join(str(cell) for cell in row.values()))
             raise InputError(
-                f"{path}, line {reader.line_num}: not finite numbers, or a sigma that is not positive: mend it"
+                f"{path}, line {reader.line_num}: '{cells}' is not one finite number a column, or its sigma is not "
+                "positive: mend it"
             )
         names.append(row.get("id") or str(number))
         rows.append([*values, sigma])

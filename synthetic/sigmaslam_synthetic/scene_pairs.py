@@ -149,7 +149,8 @@ class ScenePairs:
             eye = Eye(CameraModel(self.size, self.size, focal, focal, centre, centre))
             result.append(renderer.render(eye, T, time))
             if self.stereo:
-                result.append(renderer.render(eye, T @ _to_right_eye(rng, _median_depth(result[0])), time))
+                baseline = _median_depth(result[0]) * np.exp(rng.uniform(*np.log(_BASELINES)))
+                result.append(renderer.render(eye, T @ rigid_motion(np.eye(3), [baseline, 0.0, 0.0]), time))
             if self.forward:
                 later = np.minimum(time + rng.uniform(*_LATER), _DURATION)
                 result.append(renderer.render(eye, T @ _advance(rng, _median_depth(result[-1])), later))
@@ -205,11 +206,6 @@ def _transfer(views0: RenderedViews, views1: RenderedViews, points: np.ndarray) 
 
 def _median_depth(views: RenderedViews) -> float:
     return float(views.depth[torch.isfinite(views.depth)].median())
-
-
-def _to_right_eye(rng: np.random.Generator, depth: float) -> np.ndarray:
-    """Pose of the right eye in the left one, (4, 4)."""
-    return rigid_motion(np.eye(3), [depth * np.exp(rng.uniform(*np.log(_BASELINES))), 0.0, 0.0])
 
 
 def _advance(rng: np.random.Generator, depth: float) -> np.ndarray:

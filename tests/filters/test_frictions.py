@@ -65,6 +65,10 @@ REFUSED = {
                           lambda: UKF.update(beliefs(2), bent_measurement(2, 2), tensor(0.0, 0.0, 0.0))),
     "infinite value": (filters.FilterError, "measured value of the first has entries that are not finite",
                        lambda: UKF.update(beliefs(2), bent_measurement(2, 2), tensor(0.0, torch.inf))),
+    "mean": (filters.FilterError, "prior mean of the first has entries that are not finite",
+             lambda: UKF.predict(filters.Gaussian(tensor(0.0, torch.nan), EYE), bent_motion(2))),
+    "function": (filters.FilterError, "not finite, unlike prior and noise: look at inputs and at what the model's",
+                 lambda: UKF.predict(filters.Gaussian(tensor(0.0, 0.0), EYE), filters.MotionModel(torch.log, EYE))),
     "matrices by time": (ValueError, "step 1 of 4.*list of models, one for each step", lambda: KF.filter(
         beliefs(2), filters.LinearMotion(EYE.expand(3, 2, 2), EYE), SEE, random_numbers(4, 2))),
     "noises by time": (ValueError, "batch of the covariance .3,.*list of models, one for each step", lambda: UKF.filter(

@@ -77,12 +77,27 @@ def feed(image: np.ndarray, count: int) -> dict[str, np.ndarray]:
     return {"image": image, "count": np.array(count, np.int64)}
 
 
+@pytest.mark.long
+def test_features_of_other_weights_are_exported_without_a_trace(weights, tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """A trace takes a minute of CPU, and all of it where machines are shared."""
+    monkeypatch.setattr(torch.onnx, "export", None)
+    assert export_features(weights, tmp_path / "features.onnx") <= 1e-4
+    assert_equal_torch(tmp_path / "features.onnx", weights)
+    assert export_features(shipped("features.safetensors"), tmp_path / "same.onnx") <= 1e-4
+    assert (tmp_path / "same.onnx").read_bytes() == shipped("features.onnx").read_bytes()
+
+
 @pytest.mark.slow
-def test_exported_features_equal_torch_at_other_sizes_and_counts(weights, tmp_path):
-    """None of them was traced (256x320, 512) or checked by the export (192x416, 700)."""
-    out = tmp_path / "features.onnx"
-    assert export_features(weights, out) <= 1e-4
-    graph, twin = OnnxGraph(out), TorchFeatures(weights)
+def test_traced_features_equal_torch_at_other_sizes_and_counts(weights, tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """As where the network is no longer that of the graph that ships."""
+    monkeypatch.setattr(network_export, "_with_weights", lambda name, weights: lambda path: path.write_bytes(b""))
+    assert export_features(weights, tmp_path / "features.onnx") <= 1e-4
+    assert_equal_torch(tmp_path / "features.onnx", weights)
+
+
+def assert_equal_torch(path: Path, weights: Path) -> None:
+    """At sizes and counts of which none was traced (256x320, 512) or checked by the export (192x416, 700)."""
+    graph, twin = OnnxGraph(path), TorchFeatures(weights)
     for height, width, count in ((96, 96, 4), (96, 96, 1152), (128, 224, 333), (480, 640, 1024), (160, 1248, 2048)):
         given = feed(noisy_texture(height, width, 3), count)
         found = graph(given)

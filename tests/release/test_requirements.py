@@ -1,4 +1,4 @@
-"""What pyproject.toml asks for and what requirements.lock pins agree."""
+"""What pyproject.toml asks for and what requirements.lock pins agree, and all files name one version."""
 
 import re
 import tomllib
@@ -15,6 +15,15 @@ LOCK = {
     for name, version in (line.split("==") for line in (ROOT / "requirements.lock").read_text().splitlines())
 }
 EXTRAS = PROJECT["optional-dependencies"]
+
+
+def test_packages_citation_and_change_log_name_one_version():
+    releases = re.findall(r"^## (\S+)(?: \((\d{4}-\d{2}-\d{2})\))?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    version, day = next(each for each in releases if each[0] != "Unreleased")
+    for path in (ROOT / name / "pyproject.toml" for name in ("", "filters", "evaluation")):
+        assert tomllib.loads(path.read_text())["project"]["version"] == version, path
+    citation = (ROOT / "CITATION.cff").read_text().splitlines()
+    assert {f"version: {version}", f"date-released: {day}"} <= set(citation)
 
 
 @pytest.mark.parametrize("text", PROJECT["dependencies"])

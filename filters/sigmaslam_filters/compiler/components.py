@@ -82,14 +82,10 @@ def _batch_size(graph: fx.Graph) -> int | None:
             return None
         if shape is not None and (any(type(length) is not int for length in shape) or shape.count(size) > 1):
             return None
-        if node.op == "call_function" and _changes_arguments(node):
+        # Operations that change their arguments.
+        if node.op == "call_function" and getattr(getattr(node.target, "_schema", None), "is_mutable", False):
             return None
     return size
-
-
-def _changes_arguments(node: fx.Node) -> bool:
-    schema = getattr(node.target, "_schema", None)
-    return schema is not None and schema.is_mutable
 
 
 def _shape_of(node: fx.Node) -> tuple[int, ...] | None:

@@ -91,4 +91,4 @@ def _diagnosis(index: tuple[int, ...], batch: torch.Size, suspects: Suspects) ->
     for name, value in smallest.items():
         if value == 0:
             return f"the {name} of the first has the smallest eigenvalue 0."
-    return "the result is not finite."
+    return "the result is not finite, unlike prior and noise: look at inputs and at what the model's function returns."

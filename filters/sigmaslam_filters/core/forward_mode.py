@@ -41,7 +41,8 @@ def push_along(
 
     Both can be differentiated again, where gradients are enabled.
     """
-    if is_mapped() or torch.compiler.is_compiling() or _is_dual_level():
+    # Outside `torch.func` torch has one level of forward derivatives.
+    if is_mapped() or torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         pushed = torch.func.jvp(function, tuple(points), tuple(directions))
         return pushed[0], pushed[1]
     graded = torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
@@ -95,8 +96,3 @@ def _ordinary(tensor: Tensor) -> Tensor:
     if tensor.is_inference() or 0 in tensor.stride():
         return tensor.clone()
     return tensor
-
-
-def _is_dual_level() -> bool:
-    """Whether this runs within forward derivatives, of which torch has one level outside `torch.func`."""
-    return bool(forward_ad._current_level >= 0)

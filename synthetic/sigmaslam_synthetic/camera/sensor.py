@@ -123,7 +123,10 @@ def expose(
     steps = 2**sensor.bits - 1
     grey: np.ndarray = np.rint(signal * np.float32(steps))
     photograph = np.rint(grey * np.float32(255.0 / steps)).astype(np.uint8) if steps != 255 else grey.astype(np.uint8)
-    return photograph if sensor.jpeg_quality is None else _compress(photograph, sensor.jpeg_quality)
+    if sensor.jpeg_quality is None:
+        return photograph
+    _, coded = cv2.imencode(".jpg", photograph, (cv2.IMWRITE_JPEG_QUALITY, sensor.jpeg_quality))
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
 
 
 def random_sensor(rng: np.random.Generator) -> Sensor:
@@ -282,9 +285,3 @@ def _normal_quantiles() -> np.ndarray:
     upper = np.array([law.inv_cdf(0.5 + (k + 0.5) / 65536) for k in range(32768)])
     upper /= np.sqrt(np.mean(upper**2))
     return np.concatenate([-upper[::-1], upper]).astype(np.float32)
-
-
-def _compress(photograph: np.ndarray, quality: int) -> np.ndarray:
-    """The image after JPEG of that quality."""
-    _, coded = cv2.imencode(".jpg", photograph, (cv2.IMWRITE_JPEG_QUALITY, quality))
-    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))

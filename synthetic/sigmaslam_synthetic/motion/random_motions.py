@@ -244,7 +244,8 @@ def insertion(rng: np.random.Generator, duration: float, centreline: np.ndarray,
     ahead = Rotation.from_matrix(frames)
     frame = RotationSpline(along, ahead)(np.minimum(place + min(1.5 * radius, margin), length))
     lateral = frame.as_matrix()[:, :, :2] @ aside[..., None]
-    push = _direction(rng)
+    push = rng.standard_normal(3)
+    push /= np.linalg.norm(push)
     position = axis(place) + lateral[..., 0] + breath[:, None] * push + tremor
     steering = _DEGREE * np.concatenate([6 * noise(rng, t, 2, 0.05, 0.3), 25 * noise(rng, t, 1, 0.01, 0.08)], axis=-1)
     steering = steering + _DEGREE * 0.15 * noise(rng, t, 3, 1.0, 5.0)
@@ -367,11 +368,6 @@ def rolling(rng: np.random.Generator, duration: float, box: FreeSpace) -> Path:
     yaw, level = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), np.zeros_like(t)
     position = np.column_stack([around(place), level]) + np.array(box.centre)
     return path_through(t[inside], position[inside], view_rotations(yaw[inside], level[inside], level[inside]))
-
-
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    vector = rng.standard_normal(3)
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _from_origin(position: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

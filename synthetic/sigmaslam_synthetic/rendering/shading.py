@@ -189,7 +189,9 @@ class Shader:
             if not len(wet):
                 return torch.zeros_like(strength)
             there = direction[:, wet] if direction.shape[1] > 1 else direction
-            light = strength[wet] * _highlight(tilted, there, wet_towards, wet_look)
+            # Blinn's highlight.
+            mirrored = _dot(tilted, _unit(there + wet_towards)).clamp_min(1e-6)
+            light = strength[wet] * (wet_look.specular * mirrored**wet_look.gloss)
             return torch.zeros_like(strength).index_copy(0, wet, light)
 
         lights = self._lights
@@ -281,9 +283,3 @@ def _dot(first: Tensor, second: Tensor) -> Tensor:
 
 def _unit(vectors: Tensor) -> Tensor:
     return vectors * torch.rsqrt(_dot(vectors, vectors).clamp_min(_TINY))
-
-
-def _highlight(normal: Tensor, towards_light: Tensor, towards_eye: Tensor, look: _Look) -> Tensor:
-    """Blinn's highlight, (N,)."""
-    half = _unit(towards_light + towards_eye)
-    return look.specular * _dot(normal, half).clamp_min(1e-6) ** look.gloss

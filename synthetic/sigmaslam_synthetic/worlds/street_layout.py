@@ -282,7 +282,9 @@ class Street:
         self, shape: Box | Cylinder | Ellipsoid | Panel, material: int, T: np.ndarray, *, shadow: bool = True
     ) -> None:
         yaw, pitch = math.atan2(T[1, 0], T[0, 0]), -math.asin(min(max(T[2, 0], -1.0), 1.0))
-        x, y, z, w = _yawed_and_pitched(yaw, pitch)
+        # Quaternion of a turn about y, then about z.
+        c, s, cp, sp = math.cos(yaw / 2), math.sin(yaw / 2), math.cos(pitch / 2), math.sin(pitch / 2)
+        x, y, z, w = -s * sp, c * sp, s * cp, c * cp
         sine = math.sqrt(x * x + y * y + z * z)
         angle = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
         rotation = (angle * x, angle * y, angle * z)
@@ -291,9 +293,3 @@ class Street:
 
 def _upright(place: np.ndarray, z: float, rng: np.random.Generator) -> np.ndarray:
     return rigid_motion(Rotation.from_euler("z", rng.uniform(0, np.pi)).as_matrix(), [*place, z])
-
-
-def _yawed_and_pitched(yaw: float, pitch: float) -> tuple[float, float, float, float]:
-    """Quaternion (x, y, z, w) of a turn about y, then about z."""
-    c, s, cp, sp = math.cos(yaw / 2), math.sin(yaw / 2), math.cos(pitch / 2), math.sin(pitch / 2)
-    return -s * sp, c * sp, s * cp, c * cp

@@ -58,6 +58,7 @@ def test_boards_have_words():
         "chessboard:9x6:0.025:1",
         "chessboard:1x6:0.025",
         "chessboard:9x6:nan",
+        "chessboard:9x6:25",
         "charuco:8x6:0.03:0.04:DICT_5X5_100",
         "circles:4x11:0.02",
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 
 import cv2
@@ -38,6 +39,16 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
         in_right = se3_inverse(rig.T_left_right) @ pose
         cv2.imwrite(str(folder / f"right{k:02d}.png"), draw_board(CHESSBOARD, rig.eyes[1], in_right))
     return folder
+
+
+@pytest.mark.long
+def test_a_picture_is_drawn_where_one_eye_lacks_the_last_image(rendered: Path, tmp_path: Path):
+    folder = shutil.copytree(rendered, tmp_path / "board")
+    (folder / "right11.png").unlink()
+    out, picture = tmp_path / "stereo.yaml", tmp_path / "corners.png"
+    result = run_here("calibrate", folder, "--board", BOARD, "--out", out, "--picture", picture)
+    assert result.returncode == 0, result.stderr
+    assert picture.is_file()
 
 
 @pytest.mark.long

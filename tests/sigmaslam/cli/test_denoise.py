@@ -87,6 +87,10 @@ def test_what_cannot_be_filtered_is_refused(noisy_pairs: Path, tmp_path: Path):
     shutil.copy(images / "000000.png", images / "000000.bmp")
     assert_refused(run_here("images", "denoise", images, "--single", "--out", tmp_path / "c"), "000000.png", "rename")
     assert_refused(run_here("images", "denoise", tmp_path / "none", "--out", tmp_path / "d"), "no such file")
+    for option in ("--sigma", "--gain"):
+        found = run_here("images", "denoise", images, option, "inf", "--out", tmp_path / "g")
+        assert found.returncode == 2
+        assert f"Invalid value for '{option}'" in found.stderr
     assert_refused(
         run_here("images", "denoise", noisy_pairs, "--stereo", "--single", "--out", tmp_path / "e"), "--single"
     )

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -39,11 +40,24 @@ def test_a_robot_is_localised_and_everything_is_written(folder, tmp_path):
     page = (out / "report.html").read_text()
     assert "position rmse" in page
     assert "http://" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "")
+    assert "contradict" not in result.stdout
+
+
+@pytest.mark.long
+def test_ranges_in_millimetres_are_told_of(folder, tmp_path):
+    wrong = shutil.copytree(folder, tmp_path / "robot")
+    head, *rows = (wrong / "sightings.csv").read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    lines = [head, *(f"{time},{landmark},{1000 * float(away)},{bearing}" for time, landmark, away, bearing in cells)]
+    (wrong / "sightings.csv").write_text("\n".join(lines) + "\n")
+    result = run_here("localize", wrong, "--out", tmp_path / "out")
+    assert "sightings contradict controls, start or map: are all in seconds, metres, radians" in result.stdout
 
 
 def test_wrong_options_are_refused(folder, tmp_path):
     out = tmp_path / "out"
     assert_refused(run_here("localize", folder, "--out", out, "--start", "1,2"), "--start 1,2", "X,Y,HEADING")
+    assert_refused(run_here("localize", folder, "--out", out, "--start", "0,0,nan"), "--start 0,0,nan", "X,Y,HEADING")
     assert_refused(run_here("localize", folder, "--out", out, "--robot", "3"), "leave out --robot")
     assert_refused(run_here("localize", tmp_path / "nowhere", "--out", out), "nowhere", "is not there")
     assert_refused(run_here("localize", folder, "--out", folder), "not an empty folder")

@@ -118,6 +118,16 @@ def test_matches_are_taken_with_their_covariance(tmp_path: Path):
     np.testing.assert_allclose(np.sqrt(values[:, 9]), expected, rtol=0.01)
 
 
+@pytest.mark.parametrize("change", [np.diag([1000.0, 1000.0, 1000.0]), np.diag([1.0, 1.0, -1.0])])
+def test_other_units_and_a_mirror_are_told_of(tmp_path: Path, change: np.ndarray):
+    points = np.column_stack([np.arange(7.0), scene(7, seed=6)])
+    source = write_csv(tmp_path / "a.csv", "id,x,y,z", points)
+    points[:, 1:] = points[:, 1:] @ change
+    control = write_csv(tmp_path / "b.csv", "id,x,y,z", points)
+    assert "handedness" not in run_here("images", "orient", source, source, "--out", tmp_path / "p.json").stdout
+    assert "units (--scale)" in run_here("images", "orient", source, control, "--out", tmp_path / "p.json").stdout
+
+
 @pytest.mark.parametrize("scale", [1.0, 2.5])
 def test_control_points_give_the_frame(tmp_path: Path, scale: float):
     T = se3_exp(np.array([1.0, -2.0, 0.5, 0.3, -0.8, 1.1]))
@@ -144,9 +154,18 @@ def test_bad_tables_are_refused(tmp_path: Path):
     rig = write_own(rectified_rig(), tmp_path)
     rest = ("--calibration", rig, "--out", tmp_path / "out.csv")
     wrong = write_csv(tmp_path / "a.csv", "u0,v0,u1", np.ones((1, 3)))
-    assert_refused(run_here("images", "triangulate", wrong, *rest), "no column v1: give a header with u0,v0,u1,v1")
+    assert_refused(
+        run_here("images", "triangulate", wrong, *rest), "no column v1 in 'u0,v0,u1': give a header with u0,v0,u1,v1"
+    )
     wrong = write_csv(tmp_path / "a.csv", "u0,v0,u1,v1", np.array([[1.0, 2.0, np.nan, 4.0]]))
-    assert_refused(run_here("images", "triangulate", wrong, *rest), "a.csv, line 2: not finite numbers")
+    assert_refused(
+        run_here("images", "triangulate", wrong, *rest), "a.csv, line 2: '1.0,2.0,nan,4.0' is not one finite number"
+    )
+    wrong.write_text("u0,v0,u1,v1\n320,5,240,1,300,2,240,0\n")
+    assert_refused(run_here("images", "triangulate", wrong, *rest), "a.csv, line 2: '320,5,240,1,")
+    right = write_csv(tmp_path / "c.csv", "u0,v0,u1,v1", seen(rectified_rig(), scene(3, 7)))
+    found = run_here("images", "triangulate", right, "--calibration", rig, "--out", tmp_path)
+    assert_refused(found, "is a folder: give the name of a file in it")
     swapped = write_csv(tmp_path / "a.csv", "u0,v0,u1,v1", seen(rectified_rig(), scene(3, 7))[:, [2, 3, 0, 1]])
     assert_refused(run_here("images", "triangulate", swapped, *rest), "none of 3 pairs meets in front of the cameras")
     two = write_csv(tmp_path / "b.csv", "id,x,y,z", np.arange(8.0).reshape(2, 4))

@@ -81,7 +81,9 @@ def train(
             _Run(state, place, out, journal).finish(workers)
         card = make_card(state, place)
         if place.leads:
-            _write_result(out, state, card)
+            with atomic_path(out / WEIGHTS_NAME) as path:
+                save_file({name: value.cpu().contiguous() for name, value in state.network.state_dict().items()}, path)
+            atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
     return card
 
 
@@ -215,12 +217,6 @@ class _Run:
             self._state.seconds = time.monotonic() - self._began
             save_checkpoint(self._checkpoint, self._state)
             self._saved = self._state.step
-
-
-def _write_result(out: Path, state: TrainingState, card: dict[str, Any]) -> None:
-    with atomic_path(out / WEIGHTS_NAME) as path:
-        save_file({name: value.cpu().contiguous() for name, value in state.network.state_dict().items()}, path)
-    atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
 
 
 def _note(loss: PairLoss) -> str:

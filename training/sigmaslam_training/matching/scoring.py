@@ -84,7 +84,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
             )
         ]
         clock.seconds()
-        sets = [match_set for record in _records(folders[0]) for match_set in record.sets.values()]
+        sets = [match_set for record in map(load_record, folders[0]) for match_set in record.sets.values()]
         told = _open_bar(progress, "training the scorer", config.steps)
         scorer = train_scorer(sets, config.steps, config.seed, out / _SCORER_CHECKPOINT, told)
         clock.seconds()
@@ -145,17 +145,13 @@ def _make_records(progress: Progress, folder: Path, seed: int, count: int, worke
     return [record_path(folder, index) for index in range(count)]
 
 
-def _records(paths: list[Path]) -> Iterator[PairRecord]:
-    return (load_record(path) for path in paths)
-
-
 def _collect(
     progress: Progress,
     paths: list[Path],
     collect: Callable[[Iterator[PairRecord], Callable[[int], None]], VerifierRows],
 ) -> VerifierRows:
     task = progress.add_task("refining matches", total=len(paths), note="")
-    return collect(_records(paths), lambda done: progress.update(task, completed=done))
+    return collect(map(load_record, paths), lambda done: progress.update(task, completed=done))
 
 
 def _train_verifier(
@@ -182,7 +178,7 @@ def _train_verifier(
 def _scorer_metrics(scorer: MatchScorer, paths: list[Path]) -> dict[str, float]:
     """Means over the sets of one kind that have at least 8 right and 8 wrong matches."""
     by_kind: dict[str, list[tuple[float, ...]]] = {}
-    for record in _records(paths):
+    for record in map(load_record, paths):
         for kind, of_kind in record.sets.items():
             _, _, side, _, error = make_sample(of_kind)
             right = error < RIGHT
