@@ -15,7 +15,8 @@ endif
 # What an installation is made of: when one of these changes, it is made again.
 BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock sigmaslam/both_ways.inc \
          sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc sigmaslam/estimation/estimator.cpp \
-         sigmaslam/estimation/estimator.inc sigmaslam/estimation/views.inc
+         sigmaslam/estimation/estimator.inc sigmaslam/estimation/views.inc \
+         sigmaslam/reconstruction/depths.cpp sigmaslam/reconstruction/depths.inc
 
 .PHONY: demo test test-long test-slow lint docs results dist publish wheel sbom clean
 
@@ -64,7 +65,8 @@ wheel: dist
 	    rm -rf build/check; $$python -m venv build/check; \
 	    build/check/bin/python -m pip install --quiet --no-index --no-deps --find-links dist sigmaslam; \
 	    build/check/bin/python -m pip install --quiet $(INSTALL_FLAGS) sigmaslam; \
-	    (cd build && check/bin/python -c "import sigmaslam.frontend._kernels, sigmaslam.estimation._estimator" \
+	    (cd build && check/bin/python -c "import sigmaslam.frontend._kernels, sigmaslam.estimation._estimator, \
+	        sigmaslam.reconstruction._depths" \
 	        && check/bin/sigmaslam demo); \
 	done
 

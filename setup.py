@@ -38,5 +38,6 @@ ESTIMATOR = compiled(
     ["estimator.inc", "views.inc"],
     ["-O2", *VECTORISED],
 )
+DEPTHS = compiled("sigmaslam.reconstruction._depths", "sigmaslam/reconstruction", "depths.cpp", ["depths.inc"], ["-O3"])
 
-setup(ext_modules=[KERNELS, ESTIMATOR])
+setup(ext_modules=[KERNELS, ESTIMATOR, DEPTHS])

@@ -25,7 +25,10 @@ ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("build", "setuptools", "pybind11")
 CROSS_TOOLS = ("ziglang", "wheel", "auditwheel")
 MANY_LINUX, GLIBC = ("x86_64", "aarch64"), "2.28"
-COMPILED = ("sigmaslam/frontend/_kernels.", "sigmaslam/estimation/_estimator.")
+COMPILED = (
+    *("sigmaslam/frontend/_kernels.", "sigmaslam/estimation/_estimator."),
+    "sigmaslam/reconstruction/_depths.",
+)
 WITHOUT_KERNELS = (
     "what the compiler said stands above; if there is none, apt install g++; if it lacks Python's headers, name an "
     "interpreter that has them, for --many-linux not Debian's, whose pyconfig.h is of one machine"

@@ -30,13 +30,14 @@ class StereoRectifier:
         R_rectified_left, R_rectified_right: (3, 3) rotations from the original to the rectified eye.
         valid_mask: (H, W) uint8, 255 where the left rectified pixel comes from inside the left image, at
             least `VALID_MARGIN` px from its border; None for a pass-through.
+        raised: rows by which right images are raised, as `raise_right` was told.
 
     Raises:
         CalibrationError: no rectangle of the scene is seen by both eyes.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
-        self.camera = camera
+        self.camera, self.raised = camera, 0.0
         self.valid_mask: np.ndarray | None = None
         self._maps: tuple[tuple[np.ndarray, np.ndarray], ...] | None = None
         left = camera.left
@@ -90,6 +91,7 @@ class StereoRectifier:
 
     def raise_right(self, rows: float) -> None:
         """From now on the right images, which a bump has lowered by so many rows, are raised by them."""
+        self.raised += rows
         if self._maps is None:
             model = self.camera.right
             u, v = np.meshgrid(np.arange(model.width, dtype=np.float32), np.arange(model.height, dtype=np.float32))

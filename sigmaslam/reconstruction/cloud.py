@@ -11,6 +11,7 @@ import numpy as np
 from sigmaslam.files import write_ply
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import skew, transform_points
+from sigmaslam.reconstruction.disparity import kernels
 from sigmaslam.table import Table
 
 # Rows and columns of the six numbers of a symmetric matrix.
@@ -130,6 +131,10 @@ class DepthPixels(Table):
 
     def thinned(self, camera: RectifiedStereo, size: float) -> DepthPixels:
         """The most certain pixel of each voxel of the camera's frame; those beside it have nearly the same errors."""
+        if kernels is not None:
+            pair = camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline
+            numbers = pair, size, _SIGMA_SHARE, _MOST_LEVEL
+            return self.select(kernels.thin(self.pixels, self.disparity, self.variance, *numbers))
         points = self.points(camera)
         relative = self.variance / self.disparity**2
         sigma = np.sqrt(np.einsum("ni,ni->n", points, points) * relative)
@@ -137,7 +142,7 @@ class DepthPixels(Table):
         relative = relative[order]
         count = np.diff(np.r_[first, len(order)])
         best = relative == np.repeat(np.minimum.reduceat(relative, first), count)
-        return self.select(np.minimum.reduceat(np.where(best, order, len(order)), first))
+        return self.select(np.sort(np.minimum.reduceat(np.where(best, order, len(order)), first)))
 
 
 class VoxelCloud:

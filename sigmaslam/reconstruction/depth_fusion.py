@@ -8,15 +8,13 @@ the scalar form of the Kalman filter in `sigmaslam_filters`, to which a test hol
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.reconstruction.disparity import DisparityMap, pixel_grid, shrink, window_mean
-from sigmaslam.table import Table
+from sigmaslam.reconstruction.disparity import DisparityMap, kernels, pixel_grid, shrink, window_mean
 
 GATE = 6.635
 """99 % of chi-square with one degree of freedom: disparities that differ by more are of different surfaces."""
@@ -39,8 +37,6 @@ _MEDIAN_STRIDE = 8
 _FLOW_VARIANCE, _FLOW_SCALE, _GATE_2D = np.float32(0.3**2), 4, 9.21
 # Of the pixels whose depth is as expected, at least this share must also be where the pose says.
 _LEAST_SHARE = 0.5
-# Pixels that are measured at a time: arrays of them stay in the cache of a core.
-_PART = 16384
 # A coordinate of what is in no image.
 _OUTSIDE = np.float32(-1e4)
 # What a small step, translation before rotation, adds to normalised coordinates x, y and to the relative depth of a
@@ -147,23 +143,11 @@ def fuse_depth(
     support, contradictions = np.zeros((2, len(known)), np.uint8)
     cost = np.zeros_like(mean)
     texture = [each.ravel()[known] for each in _texture(image.astype(np.float32))]
-    parts = [slice(first, first + _PART) for first in range(0, max(len(known), 1), _PART)]
     for view, pose, covariance in others:
-        step = pose, step_products(covariance)
-        seen = _Seen.concatenate([_measure(view, *step, rays[:, at], mean[at], variance[at], camera) for at in parts])
-        noise = np.float32(1.0 - shared) * seen.noise + seen.pose
-        # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
-        expected = seen.derivative**2 * variance + noise + np.float32(shared) * seen.noise + common
-        squared = seen.innovation**2
-        there = squared <= GATE * expected
-        agrees = there & _looks_alike(image, texture, seen, known)
-        if np.count_nonzero(agrees) < _LEAST_SHARE * np.count_nonzero(there):
-            # Most of the image moves against the pose: it is that of a moving body, and confirms nothing at rest.
-            agrees[:] = False
-        cost += np.where(agrees, squared / expected, np.float32(0.0))
-        support += agrees
-        contradictions += np.where(there, ~agrees, seen.innovation < 0.0)
-        mean, variance = kalman_update(mean, variance, seen.innovation, seen.derivative, noise, agrees)
+        seen = _measure(view, pose, step_products(covariance), rays, mean, variance, camera)
+        images = _compare(image, known, seen[0])
+        states = mean, variance, common, cost, support, contradictions
+        mean, variance, cost, support, contradictions = _update(known, seen, *images, texture, shared, *states)
     # Where the views differ by more than they should, or less, variances are scaled: the mean of the posterior of a
     # scale that has an inverse gamma distribution. That they agree says nothing of what they have in common.
     scale = (_FREEDOM + cost) / (_FREEDOM + support)
@@ -177,6 +161,45 @@ def fuse_depth(
     )
 
 
+def _update(
+    known: np.ndarray,
+    seen: np.ndarray,
+    windows: list[np.ndarray],
+    flow: list[np.ndarray],
+    texture: list[np.ndarray],
+    shared: float,
+    *states: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Mean, variance, cost, support and contradictions (N,) after a view; `states` are those before, the third common.
+
+    What moves along its own surface has the depth that is expected, and another texture. The variance of the difference
+    is held against what noise, the resampling and an uncertain place make of the texture, scaled by the median pixel.
+    """
+    if kernels is not None:
+        gates = shared, GATE, _GATE_2D, _FLOW_SCALE, _FLOW_VARIANCE
+        return tuple(kernels.update(known, seen, windows, texture, flow, gates, _MEDIAN_STRIDE, _LEAST_SHARE, *states))
+    mean, variance, common, cost, support, contradictions = states
+    _, innovation, derivative, noise, by_pose, place_u, place_v = seen
+    own = np.float32(1.0 - shared) * noise + by_pose
+    # What is common does not cancel in the difference unless the views are alike: the gate allows for it.
+    expected = derivative**2 * variance + own + np.float32(shared) * noise + common
+    there = innovation**2 <= GATE * expected
+    share, difference, square = (each.ravel()[known] for each in windows)
+    share = np.maximum(share, np.float32(1e-3))
+    place_u, place_v = place_u + _RESAMPLING, place_v + _RESAMPLING
+    ratio = (square / share - (difference / share) ** 2) / (_ROUNDING + texture[0] * place_u + texture[1] * place_v)
+    some = ratio[::_MEDIAN_STRIDE][np.isfinite(innovation[::_MEDIAN_STRIDE])]
+    moved_u, moved_v = (_FLOW_SCALE * each.ravel()[known] for each in flow)
+    rests = moved_u**2 / (place_u + _FLOW_VARIANCE) + moved_v**2 / (place_v + _FLOW_VARIANCE)
+    agrees = there & (ratio <= GATE * (np.median(some) if len(some) else 0.0)) & (rests <= _GATE_2D)
+    if np.count_nonzero(agrees) < _LEAST_SHARE * np.count_nonzero(there):
+        # Most of the image moves against the pose: it is that of a moving body, and confirms nothing at rest.
+        agrees[:] = False
+    cost = cost + np.where(agrees, innovation**2 / expected, np.float32(0.0))
+    contradictions = contradictions + np.where(there, ~agrees, innovation < 0.0)
+    return *kalman_update(mean, variance, innovation, derivative, own, agrees), cost, support + agrees, contradictions
+
+
 def kalman_update(
     mean: np.ndarray,
     variance: np.ndarray,
@@ -185,7 +208,7 @@ def kalman_update(
     noise: np.ndarray,
     agrees: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Posterior of filters of one state each, by one measurement each; where it does not agree, the prior.
+    """Means and variances (N,) of filters of one state, by one measurement each; where it does not agree, the priors.
 
     Args:
         mean, variance: (N,) of the priors.
@@ -193,8 +216,6 @@ def kalman_update(
         derivative: (N,) of the prediction by the state.
         noise: (N,) variance of the measurement.
         agrees: (N,) bool.
-    Returns:
-        (N,) means and variances.
     """
     gain = derivative * variance / (derivative**2 * variance + noise)
     moved = np.where(agrees, mean + gain * innovation, mean)
@@ -203,33 +224,8 @@ def kalman_update(
     return moved, np.where(agrees, left, variance)
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen(Table):
-    """A measurement of N pixels by another view, with an innovation of NaN where no disparity is known there.
-
-    Attributes:
-        grey: (N,) grey value where the point appears; NaN where it is not in the view.
-        innovation: (N,) that disparity minus the predicted one, pixels.
-        derivative: (N,) of the latter less the former by the state.
-        noise, pose: (N,) variance of the disparity seen, and of what the pose between the views adds, pixels squared.
-        place_u, place_v: (N,) variance of u and v by the state and the pose, pixels squared.
-    """
-
-    grey: np.ndarray
-    innovation: np.ndarray
-    derivative: np.ndarray
-    noise: np.ndarray
-    pose: np.ndarray
-    place_u: np.ndarray
-    place_v: np.ndarray
-
-
 def step_products(covariance: np.ndarray) -> np.ndarray:
-    """(6, 10) float32 covariance of what `_BY_STEP` moves, xx to zz: factors of each product of two of q, 1, a and b.
-
-    Args:
-        covariance: (6, 6) of the step.
-    """
+    """(6, 10) float32 covariance of what `_BY_STEP` moves, xx to zz: factors of products of two of q, 1, a and b."""
     factors = np.einsum("kmi,ij,lnj->klmn", _BY_STEP, covariance, _BY_STEP)[*np.triu_indices(3)]
     twice = factors + factors.swapaxes(1, 2)
     twice[:, range(4), range(4)] /= 2.0
@@ -244,92 +240,59 @@ def _measure(
     state: np.ndarray,
     variance: np.ndarray,
     camera: RectifiedStereo,
-) -> _Seen:
+) -> np.ndarray:
+    """(7, N) grey value where a point appears in a view, or NaN; disparity there minus the predicted one, or NaN;
+    derivative of the latter less the former by the state; variances of the disparity seen, of what the pose adds, and
+    of the place u and v by state and pose, pixels squared."""
+    fx, fy = np.float32(camera.fx), np.float32(camera.fy)
     focal_baseline = np.float32(camera.focal_baseline)
-    R, t = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
-    turned = R @ rays
     # Point times inverse depth: the ray and what the step adds.
-    shift = t / focal_baseline
+    R, shift = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32) / focal_baseline
+    if kernels is not None:
+        numbers = camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline, _MIN_DEPTH * camera.baseline
+        step = np.r_[R.ravel(), shift]
+        return np.asarray(kernels.measure(view.sampled, view.image, numbers, step, products, rays, state, variance))
+    turned = R @ rays
     x, y, z = turned + shift[:, None] * state
     ahead = z * focal_baseline > _MIN_DEPTH * camera.baseline * state
     inverse = np.float32(1.0) / np.where(ahead, z, np.float32(np.inf))
     a, b = x * inverse, y * inverse
-    u = np.where(ahead, camera.fx * a + np.float32(camera.cx), _OUTSIDE)
-    v = camera.fy * b + np.float32(camera.cy)
+    u, v = np.where(ahead, fx * a + np.float32(camera.cx), _OUTSIDE), fy * b + np.float32(camera.cy)
     predicted = state * inverse
-    disparity, noise, slope_u, slope_v, grey = _sample((view.sampled, view.image), u, v)
+    disparity, noise, slope_u, slope_v, grey = _sample(np.dstack([view.sampled, view.image]), u, v)
     # By the state: of the predicted disparity, and of the one seen where the prediction moves to.
-    moves_u = np.float32(camera.fx) * (shift[0] - a * shift[2]) * inverse
-    moves_v = np.float32(camera.fy) * (shift[1] - b * shift[2]) * inverse
+    moves_u, moves_v = fx * (shift[0] - a * shift[2]) * inverse, fy * (shift[1] - b * shift[2]) * inverse
     derivative = turned[2] * inverse**2 - slope_u * moves_u - slope_v * moves_v
-    by_pose, place_u, place_v = _pose_variances(products, a, b, predicted, slope_u, slope_v, camera)
-    place_u, place_v = moves_u**2 * variance + place_u, moves_v**2 * variance + place_v
-    return _Seen(grey, disparity - predicted, derivative, noise, by_pose, place_u, place_v)
-
-
-def _pose_variances(
-    products: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-    disparity: np.ndarray,
-    slope_u: np.ndarray,
-    slope_v: np.ndarray,
-    camera: RectifiedStereo,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Variances (N,) of an innovation and of the place u and v by the step, pixels squared.
-
-    Args:
-        products: (6, 10) as of `step_products`.
-        a, b: (N,) normalised coordinates of the place.
-        disparity: (N,) predicted there.
-        slope_u, slope_v: (N,) of the disparities seen there.
-        camera: the rectified pair.
-    """
-    q, one = disparity / np.float32(camera.focal_baseline), np.ones_like(a)
+    q, one = predicted / focal_baseline, np.ones_like(a)
     xx, xy, xz, yy, yz, zz = products @ np.stack([q * q, q, q * a, q * b, one, a, b, a * a, a * b, b * b])
     # The depth moves the place, too, and the slopes there the disparity: it changes by e x + f y + g z.
-    e, f = np.float32(camera.fx) * slope_u, np.float32(camera.fy) * slope_v
-    g = disparity - e * a - f * b
-    innovation = e * (e * xx + 2.0 * (f * xy + g * xz)) + f * (f * yy + 2.0 * g * yz) + g * g * zz
-    place_u = np.float32(camera.fx**2) * (xx + a * (a * zz - 2.0 * xz))
-    place_v = np.float32(camera.fy**2) * (yy + b * (b * zz - 2.0 * yz))
-    return innovation, place_u, place_v
+    e, f = fx * slope_u, fy * slope_v
+    g = predicted - e * a - f * b
+    by_pose = e * (e * xx + 2.0 * (f * xy + g * xz)) + f * (f * yy + 2.0 * g * yz) + g * g * zz
+    place_u = moves_u**2 * variance + fx**2 * (xx + a * (a * zz - 2.0 * xz))
+    place_v = moves_v**2 * variance + fy**2 * (yy + b * (b * zz - 2.0 * yz))
+    return np.stack([grey, disparity - predicted, derivative, noise, by_pose, place_u, place_v])
 
 
-def _looks_alike(image: np.ndarray, texture: list[np.ndarray], seen: _Seen, known: np.ndarray) -> np.ndarray:
-    """(N,) bool, measured pixels whose windows show the same where the points appear in the other image.
-
-    What moves along its own surface has the depth that is expected, and another texture. The variance of the difference
-    is held against what noise, the resampling and an uncertain place make of the texture, scaled by the median pixel.
-
-    Args:
-        image: (H, W) uint8 of the reference.
-        texture: (N,) each, as of `_texture`.
-        seen: of the N points.
-        known: (N,) their flat indices in the reference.
-    """
-    there = np.isfinite(seen.grey)
-    pixels, grey = known[there], seen.grey[there]
-    weight, difference = np.zeros((2, *image.shape), np.float32)
-    weight.ravel()[pixels] = 1.0
-    difference.ravel()[pixels] = image.ravel()[pixels] - grey
-    share, mean, square = (window_mean(each) for each in (weight, difference, difference**2))
-    share = np.maximum(share, np.float32(1e-3))
-    place_u, place_v = seen.place_u + _RESAMPLING, seen.place_v + _RESAMPLING
-    ratio = (square / share - (mean / share) ** 2).ravel()[known]
-    ratio /= _ROUNDING + texture[0] * place_u + texture[1] * place_v
-    some = ratio[::_MEDIAN_STRIDE][np.isfinite(seen.innovation[::_MEDIAN_STRIDE])]
-    alike = ratio <= GATE * (np.median(some) if len(some) else 0.0)
+def _compare(image: np.ndarray, known: np.ndarray, grey: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Means of weight, difference and its square in windows, and flow u and v, to a view with such grey values (N,)."""
+    if kernels is not None:
+        weight, difference, square, warped = kernels.compare(image, known, grey)
+    else:
+        there = np.isfinite(grey)
+        pixels, grey = known[there], grey[there]
+        (weight, difference), warped = np.zeros((2, *image.shape), np.float32), image.copy()
+        weight.ravel()[pixels] = 1.0
+        difference.ravel()[pixels] = image.ravel()[pixels] - grey
+        warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
+        square = difference**2
     # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
-    warped = image.copy()
-    warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
     small, moved = (shrink(each, _FLOW_SCALE) for each in (image, warped))
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     search.setFinestScale(0)
     flow = cv2.split(search.calc(small, moved, np.zeros((*small.shape, 2), np.float32)))
-    moved_u, moved_v = (_FLOW_SCALE * cv2.resize(each, image.shape[::-1]).ravel()[known] for each in flow)
-    rests = moved_u**2 / (place_u + _FLOW_VARIANCE) + moved_v**2 / (place_v + _FLOW_VARIANCE)
-    return np.asarray(alike & (rests <= _GATE_2D))
+    windows = [window_mean(each) for each in (weight, difference, square)]
+    return windows, [np.asarray(cv2.resize(each, image.shape[::-1])) for each in flow]
 
 
 def _texture(image: np.ndarray) -> np.ndarray:
@@ -338,19 +301,13 @@ def _texture(image: np.ndarray) -> np.ndarray:
     return np.stack([window_mean(cv2.filter2D(image, -1, kernel) ** 2) for kernel in (step, step.T)])
 
 
-def _sample(images: Sequence[np.ndarray], u: np.ndarray, v: np.ndarray) -> list[np.ndarray]:
-    """Bilinear values of images (H, W) or (H, W, C) at N pixels, NaN where one around is; (N,) of each channel."""
-    # OpenCV takes maps of at most 32767 columns, and none without a row.
-    columns = 1024
-    rows = max(-(-len(u) // columns), 1)
-    maps = np.full((2, rows * columns), _OUTSIDE, np.float32)
-    maps[0, : len(u)], maps[1, : len(u)] = u, v
-    map_u, map_v = maps.reshape(2, rows, columns)
-    sampled = []
-    for image in images:
-        found = cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR, borderValue=(np.nan,) * 4)
-        sampled += [each.ravel()[: len(u)] for each in cv2.split(found)]
-    return sampled
+def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """(C, N) bilinear values of an image (H, W, C) at N pixels, NaN where one around is."""
+    inside = (u >= 0) & (v >= 0) & (u < image.shape[1] - 1) & (v < image.shape[0] - 1)
+    left, top = (np.where(inside, each, 0).astype(np.int64) for each in (u, v))
+    right, low = (np.where(inside, each, np.float32(np.nan))[:, None] % 1 for each in (u, v))
+    upper, lower = ((1 - right) * image[row, left] + right * image[row, left + 1] for row in (top, top + 1))
+    return np.asarray(((1 - low) * upper + low * lower).T)
 
 
 def _spread(values: np.ndarray, known: np.ndarray, shape: tuple[int, ...], missing: float) -> np.ndarray:

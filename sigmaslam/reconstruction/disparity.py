@@ -10,9 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
 
 import cv2
 import numpy as np
+
+kernels: ModuleType | None
+try:
+    kernels = import_module("sigmaslam.reconstruction._depths")
+except ImportError:  # installed without a compiler
+    kernels = None
 
 # Semi-global matching: side of its blocks, what steps of disparity cost, twice OpenCV's own rule, the largest gradient
 # that counts, by how many percent the best must win, and how large what departs by more than a pixel must be to be
@@ -184,45 +192,50 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
     # What is saturated shows no texture, and its edges are not where the surface's are.
     seen = cv2.remap(right, u - smooth, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     weight = (known & (left < _SATURATED) & (seen < _SATURATED)).astype(np.float32)
-    share = window_mean(weight)
-    inverse = np.float32(1.0) / np.maximum(share, np.float32(1e-3))
-
-    def mean(weighted: np.ndarray) -> np.ndarray:
-        return window_mean(weighted) * inverse
-
-    pixels = (2 * _RADIUS + 1) ** 2 * np.maximum(share, np.float32(1e-3))
-    counted = reference * weight
-    mean_reference = mean(counted)
-    spread_reference = mean(counted * counted) - mean_reference**2
     for step in range(_STEPS):
         smooth = smooth if step == 0 else _smooth(found)
         warped = cv2.remap(other, u - smooth, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         slope = cv2.remap(gradient, u - smooth, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        counted = warped * weight
-        mean_warped = mean(counted)
-        spread = mean(counted * counted) - mean_warped**2
-        gain = np.sqrt((spread_reference + _ROUNDING) / np.maximum(spread + _ROUNDING, _ROUNDING))
-        gain = np.clip(gain, 1.0 / _MOST_GAIN, _MOST_GAIN)
-        difference = ((reference - mean_reference) - gain * (warped - mean_warped)) * weight
-        slope *= gain * weight
-        mean_slope, mean_difference = mean(slope), mean(difference)
-        texture = np.maximum(mean(slope * slope) - mean_slope**2, np.float32(1e-6))
-        product = mean(slope * difference) - mean_slope * mean_difference
-        unexplained = mean(difference * difference) - mean_difference**2 - product**2 / texture
-        # Grey values are whole numbers: their rounding is noise where nothing else is.
-        noise = (np.maximum(unexplained, 0.0) + _ROUNDING) / pixels
-        moved = product / (texture + noise / _PRIOR_VARIANCE)
-        departs, found = found, np.where(known, smooth - np.clip(moved, -_LONGEST, _LONGEST), _NOWHERE)
+        moved, bound = _gauss_newton(reference, warped, slope, weight)
+        departs, found = found, np.where(known, smooth - moved, _NOWHERE)
     # What the last step began with, about the smooth surface.
     relief = np.where(known, np.minimum(np.abs(departs - smooth), _SAME_SURFACE), np.float32(0.0)) ** 2
-    bound = np.minimum(noise / texture, _WIDEST_BOUND)
     inverse = np.float32(1.0) / np.maximum(window_mean(known.astype(np.float32)), np.float32(1e-3))
     aligned = np.where(known, found, np.float32(0.0))
-    edge = np.minimum(np.abs(aligned - mean(aligned)), _WIDEST_EDGE) ** 2
+    edge = np.minimum(np.abs(aligned - window_mean(aligned) * inverse), _WIDEST_EDGE) ** 2
     # Rectification leaves as much along the rows as across them, where it can be seen.
-    variance = np.float32(_FLOOR + float(np.mean(offset**2))) + _BY_BOUND * bound + _BY_RELIEF * mean(relief)
-    variance += _BY_EDGE * edge
+    variance = np.float32(_FLOOR + float(np.mean(offset**2))) + _BY_BOUND * bound + _BY_EDGE * edge
+    variance += _BY_RELIEF * (window_mean(relief) * inverse)
     return DisparityMap(np.where(known, aligned, np.float32(np.nan)), variance)
+
+
+def _gauss_newton(
+    reference: np.ndarray, warped: np.ndarray, slope: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (H, W) of the disparities, pixels, and their Cramer-Rao bounds, pixels squared; `weight` is 1 or 0."""
+    if kernels is not None:
+        limits = _PRIOR_VARIANCE, _WIDEST_BOUND, _ROUNDING, _MOST_GAIN, _LONGEST
+        return tuple(kernels.gauss_newton(reference, warped, slope, weight, limits))
+    inverse = np.float32(1.0) / np.maximum(window_mean(weight), np.float32(1e-3))
+
+    def mean(weighted: np.ndarray) -> np.ndarray:
+        return window_mean(weighted) * inverse
+
+    (mean_reference, spread_reference), (mean_warped, spread) = (
+        (each := mean(image * weight), mean((image * weight) ** 2) - each**2) for image in (reference, warped)
+    )
+    gain = np.sqrt((spread_reference + _ROUNDING) / np.maximum(spread + _ROUNDING, _ROUNDING))
+    gain = np.clip(gain, 1.0 / _MOST_GAIN, _MOST_GAIN)
+    difference = ((reference - mean_reference) - gain * (warped - mean_warped)) * weight
+    slope = slope * (gain * weight)
+    mean_slope, mean_difference = mean(slope), mean(difference)
+    texture = np.maximum(mean(slope * slope) - mean_slope**2, np.float32(1e-6))
+    product = mean(slope * difference) - mean_slope * mean_difference
+    unexplained = mean(difference * difference) - mean_difference**2 - product**2 / texture
+    # Grey values are whole numbers: their rounding is noise where nothing else is.
+    noise = (np.maximum(unexplained, 0.0) + _ROUNDING) * inverse / np.float32(len(_WINDOW) ** 2)
+    moved = product / (texture + noise / _PRIOR_VARIANCE)
+    return np.clip(moved, -_LONGEST, _LONGEST), np.minimum(noise / texture, _WIDEST_BOUND)
 
 
 def row_offset(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> np.ndarray:

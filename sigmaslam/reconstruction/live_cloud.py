@@ -94,11 +94,13 @@ class CloudSink:
         times = np.array([each.timestamp for each in said])
         later = np.repeat(np.arange(len(said)), [len(each.relative_poses) for each in said])
         last = said[-1].calibration
+        calibration = last.disparity_offset, last.disparity_offset_sigma, last.raised
+        offset, sigma, raised = np.tile(calibration, (len(said), 1)).T
         return RecordedKeyframes(
             *(self._run, "", self._camera, np.array([each.tracks is not None for each in said]), times),
             np.array([each.T_world_camera for each in said]),
             np.array([each.covariance for each in said]),
-            *(last.disparity_offset, last.disparity_offset_sigma, np.arange(len(said))),
+            *(offset, sigma, raised, np.arange(len(said))),
             FramePairs(np.array(SPANS)[relative.span], 0 * later, later, relative.pose, relative.covariance),
             np.stack([relative.timestamp, times[later]], axis=1),
         )

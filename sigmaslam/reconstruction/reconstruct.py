@@ -200,9 +200,11 @@ def fuse_keyframes(
 
     def views() -> Generator[_NumberedView, None, None]:
         for number, frame in keyframes.images(sequence):
+            if (lower := keyframes.raised[number] - rectifier.raised) != 0.0:
+                rectifier.raise_right(lower)
             left, right = rectifier.rectify(frame.left, frame.right)
             usable = usable_pixels(frame.mask, rectifier)
-            yield number, left, measure_view(left, right, rectifier, match, keyframes.disparity_offset, usable)
+            yield number, left, measure_view(left, right, rectifier, match, keyframes.disparity_offset[number], usable)
 
     for number, left, view in read_ahead(views, 1):
         kept[number] = left, view
@@ -249,7 +251,7 @@ def fuse_keyframe(
         fuse_depth(image, reference, others, rectifier.rectified),
         keyframes.poses[number] @ T_left_rectified,
         turn_covariance(rectifier.T_rectified_left, keyframes.covariances[number]),
-        keyframes.disparity_offset_sigma,
+        float(keyframes.disparity_offset_sigma[number]),
     )
 
 

@@ -22,7 +22,7 @@ from sigmaslam.readers import StereoFrame, StereoSequence, open_sequence
 from sigmaslam.readers.open import FORMATS
 from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_covariances
-from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
+from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, read_frames
 from sigmaslam.run_record.recorded_run import read_final_trajectory
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
 from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, RUN_NAME, camera_of, check_has_trajectory
@@ -44,7 +44,9 @@ class RecordedKeyframes:
         timestamps: (K,) seconds.
         poses: (K, 4, 4) T_world_camera of the left camera, after the fact where the run has that.
         covariances: (K, 6, 6) of the poses in their own frames, translation (metres) before rotation (radians).
-        disparity_offset, disparity_offset_sigma: measured minus true disparity as last estimated, pixels.
+        disparity_offset, disparity_offset_sigma: (K,) measured minus true disparity as last estimated, pixels; of views
+            before a bump of the rig before that.
+        raised: (K,) rows by which right images are raised after a bump.
         frames: (K,) rows of the views in trajectory.tum.
         pairs: relative poses of the run.
         pair_times: (M, 2) time stamps of their earlier and later frames, seconds.
@@ -58,8 +60,9 @@ class RecordedKeyframes:
     timestamps: np.ndarray
     poses: np.ndarray
     covariances: np.ndarray
-    disparity_offset: float
-    disparity_offset_sigma: float
+    disparity_offset: np.ndarray
+    disparity_offset_sigma: np.ndarray
+    raised: np.ndarray
     frames: np.ndarray
     pairs: FramePairs
     pair_times: np.ndarray
@@ -149,8 +152,7 @@ def read_recorded_keyframes(run: Path, every: int = 1) -> RecordedKeyframes:
     if len(rows) < 2:
         raise InputError(f"{run}: has {len(rows)} frame with a pose, two are needed: track a longer sequence")
     pairs = read_frame_pairs(run / RELATIVE_POSES_NAME, len(said))
-    offset, sigma = (frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma"))
-    last = np.flatnonzero(np.isfinite(offset) & np.isfinite(sigma))
+    offset, sigma, raised = _calibrations(frames, said.timestamps[rows])
     return RecordedKeyframes(
         Path(str(entries["input"])),
         str(entries["format"]),
@@ -159,13 +161,23 @@ def read_recorded_keyframes(run: Path, every: int = 1) -> RecordedKeyframes:
         said.timestamps[rows],
         trajectory.poses[rows],
         covariances[rows],
-        float(offset[last[-1]]) if len(last) else 0.0,
-        float(sigma[last[-1]]) if len(last) else 0.0,
-        rows,
+        *(offset, sigma, raised, rows),
         pairs,
         said.timestamps[np.stack([pairs.earlier, pairs.later], axis=1)],
         Path(entries["mask"]) if entries.get("mask") else None,
     )
+
+
+def _calibrations(frames: FrameTable, times: np.ndarray) -> np.ndarray:
+    """(3, K) disparity offset, its sigma and rows raised at such times (K,): those last said while the rig was so."""
+    columns = [frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma", "raised", "timestamp")]
+    said = np.stack(columns)[:, np.isfinite(columns[0]) & np.isfinite(columns[1])]
+    if not said.shape[1]:
+        return np.zeros((3, len(times)))
+    raised = said[2] = np.nan_to_num(said[2])
+    last = {rows: k for k, rows in enumerate(raised.tolist())}
+    at = raised[np.searchsorted(said[3], times - _SAME_TIME).clip(0, len(raised) - 1)]
+    return np.asarray(said[:3, [last[rows] for rows in at.tolist()]])
 
 
 def open_input(keyframes: RecordedKeyframes, moved_to: Path | None = None) -> StereoSequence:

@@ -15,9 +15,9 @@ from sigmaslam.errors import InputError
 FRAMES_NAME = "frames.csv"
 COLUMNS = ("timestamp", "matches", "inliers", "nis", "dof", "belief", "disparity_offset", "disparity_offset_sigma")
 """Columns of numbers that frames.csv must have, next to `status` and any number of `ms_...`."""
-KEYFRAME_COLUMNS = ("keyframe", "loop")
-"""Columns that runs of earlier versions lack: 1 where the frame became a keyframe, and the time stamp of the one of
-long ago with which it closed a loop."""
+KEYFRAME_COLUMNS = ("keyframe", "loop", "raised")
+"""Columns that runs of earlier versions lack: 1 where the frame became a keyframe, the time stamp of the one of long
+ago with which it closed a loop, and rows by which right images are raised after a bump."""
 STATUSES = ("starting", "tracking", "lost", "relocalised", "skipped", "doubtful", "ambiguous", "inertial", "odometry")
 TRACKED = ("tracking", "relocalised", "doubtful", "ambiguous")
 """Of frames with a pose from their images."""

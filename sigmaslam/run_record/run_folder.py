@@ -123,6 +123,7 @@ class RunWriter:
                 f"{estimate.calibration.disparity_offset_sigma:.5f}",
                 int(estimate.tracks is not None),
                 "" if estimate.loop is None else f"{estimate.loop:.9f}",
+                f"{estimate.calibration.raised:.5f}",
                 *(f"{milliseconds[stage]:.2f}" for stage in STAGES),
             ]
         )

@@ -26,6 +26,7 @@ class CalibrationEstimate:
             its probability, above a half; its error and standard deviation, as shares of the focal length.
         worse: factor by which other errors but the scale's are larger than the calibration's sigmas say, as images
             show; covariances hold it. 1 where the sigmas suffice.
+        raised: rows by which right images are raised since the rig was bumped.
     """
 
     disparity_offset: float
@@ -33,6 +34,7 @@ class CalibrationEstimate:
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)
     causes: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     worse: float = 1.0
+    raised: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.published_state import considered_growth, published_state
 from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
 from sigmaslam.estimation.window_state import WindowState
+from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -31,12 +32,12 @@ class Reporter:
     """Makes estimates of frames.
 
     Attributes:
-        T_rectified_left: (4, 4) takes points of the left camera into the rectified one.
+        rectifier: of the images that are tracked.
         window, motion: of the tracker.
         relative_poses: relates frames to keyframes.
     """
 
-    T_rectified_left: np.ndarray
+    rectifier: StereoRectifier
     window: KeyframeWindow
     motion: MotionFilter
     relative_poses: RelativePoseReporter
@@ -71,14 +72,15 @@ class Reporter:
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)
         absolute = absolute + shift
         # The filter knows the rectified camera; users know the left camera of their calibration.
-        T_left_rectified = se3_inverse(self.T_rectified_left)
+        T_rectified_left = self.rectifier.T_rectified_left
+        T_left_rectified = se3_inverse(T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(turn_covariance(se3_inverse(pose), relative))[-1], 0.0))
         matching, by_error = adjoint @ absolute @ adjoint.T, adjoint @ by_error
         covariance = matching + by_error @ by_error.T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         covariance, matching = _within_half_turn(covariance), _within_half_turn(matching)
-        T_world_camera = T_left_rectified @ pose @ self.T_rectified_left
+        T_world_camera = T_left_rectified @ pose @ T_rectified_left
         return Estimate(
             timestamp=timestamp,
             T_world_camera=T_world_camera,
@@ -98,7 +100,7 @@ class Reporter:
             relative_poses=self.relative_poses.report(timestamp, state, fit if tracks is None else None),
             doubts=tuple(doubts.reasons),
             loop=loop,
-            inertial=describe_inertial(self.motion, self.T_rectified_left[:3, :3], T_world_camera),
+            inertial=describe_inertial(self.motion, T_rectified_left[:3, :3], T_world_camera),
         )
 
     def _report_nothing(self, timestamp: float, status: str, milliseconds: dict[str, float]) -> Estimate:
@@ -135,7 +137,8 @@ class Reporter:
         others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
         focal = self.window.camera.fx
         shares = {k: (c.probability, c.mean / focal, float(np.sqrt(c.variance)) / focal) for k, c in causes.items()}
-        return CalibrationEstimate(float(errors[0]), float(sigma[0]), others, shares, self.window.worse)
+        offset = float(errors[0]), float(sigma[0])
+        return CalibrationEstimate(*offset, others, shares, self.window.worse, self.rectifier.raised)
 
 
 def _within_half_turn(covariance: np.ndarray) -> np.ndarray:

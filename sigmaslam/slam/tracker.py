@@ -141,7 +141,8 @@ class StereoTracker:
         self._relocaliser = Relocaliser(window, keyframes, motion, unguided, admission, config.min_inliers)
         origin = None if start is None else start.of_rectified(turned)
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config, origin)
-        self._reporter = Reporter(turned, window, motion, RelativePoseReporter(turned, window, keyframes, motion))
+        relative = RelativePoseReporter(turned, window, keyframes, motion)
+        self._reporter = Reporter(self.rectifier, window, motion, relative)
         self.last_frame: MatchedFrame | None = None
         self._history = FrameHistory(window, keyframes, turned)
 

@@ -56,7 +56,8 @@ def test_each_compiler_gets_the_flags_that_it_knows(compiler: str, is_clang: boo
     monkeypatch.setitem(sys.modules, "pybind11", SimpleNamespace(get_include=str))
     monkeypatch.setattr(setuptools, "setup", lambda ext_modules: modules.extend(ext_modules))
     runpy.run_path(str(ROOT / "setup.py"))
-    assert [module.name for module in modules] == ["sigmaslam.frontend._kernels", "sigmaslam.estimation._estimator"]
+    names = ["sigmaslam.frontend._kernels", "sigmaslam.estimation._estimator", "sigmaslam.reconstruction._depths"]
+    assert [module.name for module in modules] == names
     assert len({value for module in modules for _, value in module.define_macros}) == len(modules)
     flags = {flag for module in modules for flag in module.extra_compile_args}
     assert {"-ffp-contract=off", "-O2", "-O3"} <= flags
@@ -145,7 +146,8 @@ def test_wheels_for_many_linux_are_of_their_machines(tmp_path: Path):
         with zipfile.ZipFile(path) as wheel:
             modules = [name for name in wheel.namelist() if name.endswith(".so")]
             assert sorted(Path(name).name for name in modules) == [
-                f"_{name}.{sys.implementation.cache_tag}-{machine}-linux-gnu.so" for name in ("estimator", "kernels")
+                f"_{name}.{sys.implementation.cache_tag}-{machine}-linux-gnu.so"
+                for name in ("depths", "estimator", "kernels")
             ]
             assert {int.from_bytes(wheel.read(name)[18:20], "little") for name in modules} == {number}
             wheel.extractall(tmp_path / machine)

@@ -115,7 +115,7 @@ def judge_reconstruction(source: Path) -> DepthFigures:
                 continue
             index = int(np.abs(times - keyframes.timestamps[depth.number]).argmin())
             truth = studio.frames(np.array([index]))[0]
-            single = pairs[depth.number] - np.float32(keyframes.disparity_offset)
+            single = pairs[depth.number] - np.float32(keyframes.disparity_offset[depth.number])
             # A body of -1 is the sky, and the last one of the table.
             moves = moving[truth.body]
             judged.append(judge_pixels(depth, single, truth.depth, truth.stereo_visible, moves, rectifier.rectified))

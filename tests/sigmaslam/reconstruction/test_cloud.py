@@ -3,9 +3,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, transform_points
+from sigmaslam.reconstruction import cloud
 from sigmaslam.reconstruction.cloud import DenseCloud, DepthPixels, VoxelCloud, inverse, largest_eigenvalue, write_cloud
 
 # Places of the six numbers of a symmetric matrix.
@@ -103,6 +105,18 @@ def test_a_voxel_keeps_the_most_certain_pixel_of_a_keyframe():
     )
     kept = pixels.thinned(CAMERA, 0.5)
     assert sorted(kept.variance.tolist()) == [0.01, 0.09]
+
+
+def test_compiled_thinning_is_that_of_numpy(monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("sigmaslam.reconstruction._depths", reason="installed without a compiler")
+    rng = np.random.default_rng(0)
+    places, disparity = rng.integers(0, 480, (4000, 2)), rng.uniform(2.0, 60.0, 4000)
+    pixels = DepthPixels(places, disparity, rng.choice([0.01, 0.04, 1.0], 4000), np.zeros(4000, np.uint8))
+    compiled = pixels.thinned(CAMERA, 0.3)
+    monkeypatch.setattr(cloud, "kernels", None)
+    for one, another in zip(compiled.columns(), pixels.thinned(CAMERA, 0.3).columns(), strict=True):
+        np.testing.assert_array_equal(one, another)
+    assert len(compiled) < 3000
 
 
 def test_the_file_holds_every_number(tmp_path: Path):

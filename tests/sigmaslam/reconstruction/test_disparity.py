@@ -21,6 +21,18 @@ def test_alignment_finds_the_fraction_of_a_pixel_on_a_slanted_surface():
     assert np.median(np.abs(np.round(true) - true)[inner]) > 0.2
 
 
+@pytest.mark.parametrize("size", [(41, 53), (4, 5), (30, 64)])
+def test_compiled_steps_are_those_of_numpy(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("sigmaslam.reconstruction._depths", reason="installed without a compiler")
+    rng = np.random.default_rng(0)
+    images = rng.uniform(0.0, 255.0, (3, *size)).astype(np.float32)
+    weight = (rng.random(size) > 0.3).astype(np.float32)
+    compiled = disparity._gauss_newton(*images, weight)
+    monkeypatch.setattr(disparity, "kernels", None)
+    for one, another in zip(compiled, disparity._gauss_newton(*images, weight), strict=True):
+        np.testing.assert_allclose(one, another, rtol=1e-3, atol=1e-5)
+
+
 def test_brightness_that_differs_by_an_offset_changes_nothing():
     true = np.full((HEIGHT, WIDTH), 7.4, np.float32)
     left, right = textured_pair(true, noise=0.0)

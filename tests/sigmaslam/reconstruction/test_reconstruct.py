@@ -13,14 +13,16 @@ from scipy.spatial import cKDTree
 
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers import open_sequence
 from sigmaslam.reconstruction.depth_fusion import FusedDepth
-from sigmaslam.reconstruction.disparity import DisparityMap
+from sigmaslam.reconstruction.disparity import DisparityMap, semi_global_disparity
 from sigmaslam.reconstruction.live_cloud import CloudSink
-from sigmaslam.reconstruction.reconstruct import KeyframeDepth, default_voxel
-from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, read_recorded_keyframes
+from sigmaslam.reconstruction.reconstruct import KeyframeDepth, default_voxel, fuse_keyframes
+from sigmaslam.reconstruction.recorded_keyframes import _with_frames_between, open_input, read_recorded_keyframes
 from sigmaslam.reconstruction.stereo_network import StereoNetwork
 from sigmaslam.run_record.dense_points import read_dense_points
+from sigmaslam.run_record.frame_table import read_frames
 from sigmaslam.run_record.recorded_run import read_run
 from sigmaslam.runs.request import LiveOptions
 from tests.support.commands import run_here
@@ -109,6 +111,26 @@ def test_what_a_mask_hides_gives_no_points(tracked: Path, tmp_path: Path):
         assert len(points) > 300
         # The camera moves little, and the windows of pixels before the mask end there.
         assert np.quantile(u, 0.95) < mask.shape[1] // 2
+
+
+@pytest.mark.long
+def test_keyframes_after_a_bump_are_measured_by_what_was_learned_of_it(demo_sequence: Path, tmp_path: Path):
+    def lower(k: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return left, np.roll(right, 3, axis=0) if k >= 12 else right
+
+    copy_frames(demo_sequence, tmp_path / "input", 24, lower)
+    run_here("track", tmp_path / "input", "--out", tmp_path / "run")
+    keyframes = read_recorded_keyframes(tmp_path / "run")
+    bumped = keyframes.timestamps >= read_frames(tmp_path / "run" / "frames.csv").columns["timestamp"][12] - 1e-3
+    assert not keyframes.raised[~bumped].any()
+    assert keyframes.raised[bumped] == pytest.approx(3.0, abs=0.3)
+    # Of each rig what was said of it last.
+    assert len(np.unique(keyframes.disparity_offset_sigma)) == 2
+    rectifier = StereoRectifier(keyframes.camera)
+    fused = fuse_keyframes(keyframes, open_input(keyframes), rectifier, semi_global_disparity)
+    density = {depth.number: np.isfinite(depth.measured.disparity).mean() for depth in fused}
+    before, after = ([share for k, share in density.items() if bumped[k] == is_bumped] for is_bumped in (False, True))
+    assert np.mean(after) > 0.9 * np.mean(before)
 
 
 def test_voxels_have_a_size_where_the_first_keyframe_has_no_points():
