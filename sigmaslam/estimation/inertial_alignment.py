@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from sigmaslam.estimation.inertial_buffer import InertialBuffer
-from sigmaslam.estimation.preintegration import ACCEL_BIAS, DELAY, GYRO_BIAS, POSITION, TURN, VELOCITY, Preintegrated
+from sigmaslam.estimation.preintegration import GYRO_BIAS, POSITION, SENSOR, TURN, Preintegrated
 from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY
 from sigmaslam.geometry.se3 import rotation_log, se3_exp
 
@@ -26,8 +26,8 @@ _ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 5
 _LONGEST = 10.0
 # m/s^2, standard deviation of an accelerometer's bias: data sheets of small sensors say 0.02 to 0.5.
 _ACCEL_BIAS = 0.2
-# Of gravity's length on Earth with the scale error of an accelerometer, m/s^2.
-_GRAVITY_LENGTH = 0.05
+# Of gravity's length on Earth, m/s^2: it is 9.78 to 9.83.
+_GRAVITY_LENGTH = 0.02
 # Metres and radians by which poses from frame to frame are off at least, and rad/s that a gyro's bias then is.
 _LEAST_PLACE, _LEAST_TURN = 2e-4, 2e-4
 # Gravity whose length is off by more than three sigmas and this was not found, m/s^2; nor was one whose direction is
@@ -53,7 +53,7 @@ class Alignment:
         velocity, gravity: (3,) each; the velocity is the sensor's.
         biases: (6,) of gyro, beside that of the motions, and accelerometer.
         covariance: (12, 12) of the four.
-        shared: (12, 7) of the four with delay and mounting, whose errors enter all of them.
+        shared: (12, 25) of the four with delay, factors and mounting, whose errors enter all of them.
     """
 
     velocity: np.ndarray
@@ -72,17 +72,17 @@ def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
     return bool(size <= max(_TURN_SHARE * np.sqrt(np.mean(seen**2)), _TURN_ERROR))
 
 
-def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray]:
-    """Gyro bias (3,), beside the one that motions between poses (N, 4, 4) were integrated with, and its covariance."""
+def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gyro bias (3,) on top of that of motions between poses (N, 4, 4), covariance, slope (3, 19) by the sensor."""
     R = bodies[:, :3, :3]
     turns = np.array([each.turn for each in motions])
-    slope = np.concatenate([each.slope[TURN, GYRO_BIAS] for each in motions])
+    slope, by = (np.concatenate([each.slope[TURN, part] for each in motions]) for part in (GYRO_BIAS, SENSOR))
     departure = rotation_log(turns.transpose(0, 2, 1) @ R[:-1].transpose(0, 2, 1) @ R[1:]).ravel()
     information = slope.T @ slope
     bias = np.linalg.solve(information, slope.T @ departure)
     residual = departure - slope @ bias
     variance = max(float(residual @ residual) / max(len(residual) - 3, 1), _LEAST_TURN**2)
-    return bias, _SHARED * variance * np.linalg.inv(information)
+    return bias, _SHARED * variance * np.linalg.inv(information), -np.linalg.solve(information, slope.T @ by)
 
 
 def align(
@@ -97,20 +97,16 @@ def align(
         poses: (N, 4, 4) of the camera, N >= 4.
         mounting: (4, 4) T_camera_imu.
         motions: N - 1 between successive poses, integrated with the gyro's bias and without the accelerometer's.
-        sensor_sigma: (7,) standard deviations of the clock's delay and of the mounting, perturbed from the left.
+        sensor_sigma: (25,) of the clock's delay, scale and misalignment, and the mounting, perturbed from the left.
     """
     bodies = poses @ mounting
-    found, covariance, excess = _solve(bodies, motions)
+    found, covariance, excess, columns = _solve(bodies, motions)
     if excess > _LENGTH_TOLERANCE or _tilt(covariance) > _LEAST_TILT_CERTAINTY:
         return None
-    columns = np.empty((len(found), len(sensor_sigma)))
-    for k, sigma in enumerate(sensor_sigma):
-        sides = []
-        for error in (sigma, -sigma):
-            moved = [each.corrected(error * np.eye(7)[DELAY]) for each in motions] if k == 0 else motions
-            mounted = mounting if k == 0 else se3_exp(error * np.eye(6)[k - 1]) @ mounting
-            sides.append(_solve(poses @ mounted, moved)[0])
-        columns[:, k] = 0.5 * (sides[0] - sides[1])
+    columns = columns * sensor_sigma[:-6]
+    for error in np.diag(sensor_sigma[-6:]):
+        one, other = (_solve(poses @ se3_exp(side * error) @ mounting, motions)[0] for side in (1.0, -1.0))
+        columns = np.column_stack([columns, 0.5 * (one - other)])
     covariance[6:9, 6:9] += _GYRO_BIAS_FLOOR**2 * np.eye(3)
     return Alignment(found[:3], found[3:6], found[6:], covariance + columns @ columns.T, columns * sensor_sigma)
 
@@ -120,31 +116,30 @@ def _tilt(covariance: np.ndarray) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
 
 
-def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, float]:
-    """(12,) velocity, gravity and biases, their covariance, and by how much gravity's length errs."""
+def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """(12,) velocity, gravity, biases; covariance; by how much gravity's length errs; slope (12, 19) by `SENSOR`."""
     R, p = bodies[:, :3, :3], bodies[:, :3, 3]
-    # Unknown: first place, first velocity, gravity, bias. Place and velocity of each pose as maps of these.
-    identity, unknown = np.eye(12), slice(9, 12)
-    place, speed = identity[:3].copy(), identity[3:6].copy()
-    place_known, speed_known = np.zeros(3), np.zeros(3)
-    rows, values = [place], [p[0]]
+    # Place and velocity of each pose as maps of first place, first velocity, gravity, bias; the sensor; and one.
+    identity, unknown = np.eye(12, 32), slice(9, 12)
+    place, speed = identity[:3], identity[3:6]
+    rows = [place]
     for k, each in enumerate(motions):
-        s = each.seconds
+        s, known = each.seconds, np.r_[np.zeros(3), each.velocity, each.position]
+        gained, moved = R[k] @ np.column_stack([each.slope, known]).reshape(3, 3, 26)[1:, :, 3:]
         place = place + s * speed + 0.5 * s * s * identity[6:9]
-        place_known = place_known + s * speed_known + R[k] @ each.position
-        place[:, unknown] += R[k] @ each.slope[POSITION, ACCEL_BIAS]
+        place[:, 9:] += moved
         speed = speed + s * identity[6:9]
-        speed_known = speed_known + R[k] @ each.velocity
-        speed[:, unknown] += R[k] @ each.slope[VELOCITY, ACCEL_BIAS]
-        rows.append(place.copy())
-        values.append(p[k + 1] - place_known)
-    A, y = np.concatenate(rows), np.concatenate(values)
+        speed[:, 9:] += gained
+        rows.append(place)
+    whole = np.concatenate(rows)
+    A, by, y = whole[:, :12], whole[:, 12:31], p.ravel() - whole[:, 31]
     # Errors of the samples add up between poses that are far apart in time.
     integrated = np.mean([np.trace(each.accel_noise[POSITION, POSITION]) / 3.0 for each in motions])
     least = _LEAST_PLACE**2 + _SAMPLE_NOISE * integrated
     variance, direction = least, np.zeros(3)
     for _ in range(3):  # without gravity's length, with it, and with the residuals' size
-        information, vector = A.T @ A / variance, A.T @ y / variance
+        weighted = A.T / variance
+        information, vector = weighted @ A, weighted @ y
         information[unknown, unknown] += np.eye(3) / _ACCEL_BIAS**2
         free, alone = np.linalg.inv(information), vector.copy()
         information[6:9, 6:9] += np.outer(direction, direction) / _GRAVITY_LENGTH**2
@@ -154,11 +149,16 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
         variance = _SHARED * max(float(residual @ residual) / max(len(y) - 12, 1), least)
         direction = solution[6:9] / np.linalg.norm(solution[6:9])
     length, spread = np.linalg.norm((free @ alone)[6:9]), direction @ free[6:9, 6:9] @ direction
-    end = np.concatenate([speed, identity[6:9], np.zeros((3, 12)), identity[9:]])
+    end = np.concatenate([speed, identity[6:9], np.zeros((3, 32)), identity[9:]])[:, :12]
     covariance = end @ np.linalg.inv(information) @ end.T
-    bias, covariance[6:9, 6:9] = align_gyro(bodies, motions)
-    found = np.concatenate([speed @ solution + speed_known, direction * STANDARD_GRAVITY, bias, solution[unknown]])
-    return found, 0.5 * (covariance + covariance.T), float(abs(length - STANDARD_GRAVITY) - 3.0 * np.sqrt(spread))
+    slope = -end @ np.linalg.solve(information, weighted @ by)
+    slope[:3] += speed[:, 12:31]
+    slope[3:6] -= np.outer(direction, direction @ slope[3:6])
+    bias, covariance[6:9, 6:9], slope[6:9] = align_gyro(bodies, motions)
+    velocity = speed @ np.r_[solution, np.zeros(19), 1.0]
+    found = np.concatenate([velocity, direction * STANDARD_GRAVITY, bias, solution[unknown]])
+    excess = float(abs(length - STANDARD_GRAVITY) - 3.0 * np.sqrt(spread))
+    return found, 0.5 * (covariance + covariance.T), excess, slope
 
 
 class GravitySearch:

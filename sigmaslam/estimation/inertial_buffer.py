@@ -19,13 +19,15 @@ _LARGEST_SCALE = 1e4
 class InertialBuffer(SampleBuffer):
     """Integrates samples of angular rate and specific force between images.
 
+    Of these, `factors` (2, 3, 3) are taken off, errors of scale and misalignment.
+
     Args:
         sensor: its noise and clock.
     """
 
     def __init__(self, sensor: InertialSensor) -> None:
         super().__init__(sensor.time_shift)
-        self.sensor = sensor
+        self.sensor, self.factors = sensor, np.zeros((2, 3, 3))
 
     def preintegrate(self, start: float, end: float, biases: np.ndarray, densities: np.ndarray) -> Preintegrated | None:
         """The motion between two time stamps of the camera; None without samples near them.
@@ -39,8 +41,10 @@ class InertialBuffer(SampleBuffer):
         start, end = start + self.time_shift, end + self.time_shift
         if len(table) < 2:
             return None
-        samples = InertialSamples(table[:, 0], table[:, 1:4], table[:, 4:])
-        return preintegrate(samples, start, end, biases[:3], biases[3:], self.sensor, densities)
+        measured = (table[:, 1:] - biases).reshape(-1, 2, 3).transpose(1, 0, 2)
+        gyro, accel = measured - measured @ self.factors.transpose(0, 2, 1)
+        samples, zero = InertialSamples(table[:, 0], gyro, accel), np.zeros(3)
+        return preintegrate(samples, start, end, zero, zero, self.sensor, densities)
 
 
 class LearnedNoise:

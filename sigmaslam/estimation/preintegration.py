@@ -17,7 +17,7 @@ from sigmaslam.geometry.se3 import rotation_exp, skew
 # Order of the errors of a preintegrated motion.
 TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 # What it depends on.
-GYRO_BIAS, ACCEL_BIAS, DELAY = slice(0, 3), slice(3, 6), 6
+GYRO_BIAS, ACCEL_BIAS, SENSOR = slice(0, 3), slice(3, 6), slice(6, 25)
 # Mean periods between two samples above which some are missing: jitter is less.
 _GAP = 2.5
 # Seconds of a gap across which values at both ends say what was between: bodies turn round in no less.
@@ -32,8 +32,8 @@ class Preintegrated:
         seconds: duration.
         turn: (3, 3) rotation R_start_end.
         velocity, position: (3,) changes, m/s and m.
-        slope: (9, 7) derivatives of (turn from the right, velocity, position) by gyro bias, accelerometer bias and the
-            delay of the sensor's clock, rad/s, m/s^2 and s.
+        slope: (9, 25) derivatives of (turn from the right, velocity, position) by gyro bias, accelerometer bias, the
+            delay of the clock (rad/s, m/s^2, s), and errors of scale and misalignment of both (3, 3), row by row.
         gyro_noise, accel_noise: (9, 9) covariances by the white noise of each.
         missing: seconds of it without samples.
     """
@@ -48,8 +48,8 @@ class Preintegrated:
     missing: float = 0.0
 
     def corrected(self, change: np.ndarray) -> Preintegrated:
-        """With biases and delay changed by (7,), to the first order."""
-        step = self.slope @ change
+        """With the first that the slope is by changed by (n,), to the first order."""
+        step = self.slope[:, : len(change)] @ change
         return replace(
             self,
             turn=self.turn @ rotation_exp(step[TURN]),
@@ -117,6 +117,8 @@ def preintegrate(
     scaled = errors.reshape(-1, 9, 2, 3) * np.sqrt(spectra / steps[:, None])[:, None, :, None]
     columns = scaled.transpose(2, 1, 0, 3).reshape(2, 9, -1)
     slope, noises = -errors.sum(axis=0), columns @ columns.transpose(0, 2, 1)
+    pairs = (errors[..., GYRO_BIAS], rates), (errors[..., ACCEL_BIAS], forces)
+    factors = [-np.einsum("kri,kj->rij", *pair).reshape(9, 9) for pair in pairs]
     # The same samples, taken a moment later.
     delay = np.concatenate(
         [
@@ -126,7 +128,7 @@ def preintegrate(
         ]
     )
     missing = float(steps[is_missing].sum())
-    slope = np.column_stack([slope, delay])
+    slope = np.column_stack([slope, delay, *factors])
     return Preintegrated(end - start, turn, velocity, position, slope, noises[0], noises[1], missing)
 
 

@@ -62,7 +62,7 @@ def estimator_graphs() -> dict[str, TracedModule]:
             _inertial_example(0),
             _inertial_example(1),
             [
-                *("pose", "velocity", "gravity", "mounting", "covariance", "seconds", "turn", "velocity_change"),
+                *("pose", "velocity", "gravity", "mounting", "root", "seconds", "turn", "velocity_change"),
                 *("position_change", "slope", "noise", "walk"),
             ],
             ["predicted_pose", "predicted_velocity", "predicted_covariance", "carried"],
@@ -117,5 +117,5 @@ def _inertial_example(seed: int) -> tuple[Tensor, ...]:
     root, noise = 0.004 * random(INERTIAL_SIZE, INERTIAL_SIZE), 0.001 * random(9, 9)
     pose, mounting, turn = (exp_se3(0.3 * random(6)) for _ in range(3))
     seconds = torch.tensor(0.1 + 0.2 * seed, dtype=torch.float64)
-    state = pose, random(3), 9.8 * random(3), mounting, root @ root.T, seconds
-    return *state, turn[:3, :3], random(3), random(3), random(9, 7), noise @ noise.T, 0.01 + random(2).abs()
+    state = pose, random(3), 9.8 * random(3), mounting, root, seconds
+    return *state, turn[:3, :3], random(3), random(3), random(9, 25), noise @ noise.T, 0.01 + random(2).abs()

@@ -1,4 +1,4 @@
-"""Prediction by an inertial sensor: sigma points of pose, velocity, gravity, biases, delay and mounting.
+"""Prediction by an inertial sensor: sigma points of all that it measures by.
 
 State (error coordinates in this order):
   pose      6  T_keyframe_camera, left perturbation Exp(xi) T: translation, rotation
@@ -6,32 +6,32 @@ State (error coordinates in this order):
   gravity   3  in the keyframe's frame, m/s^2
   biases    6  gyro, rad/s; accelerometer, m/s^2
   delay     1  error of the shift between the clocks, s
+  factors  18  errors of scale and misalignment: matrices on rate, and on force, row by row
   mounting  6  T_camera_imu, left perturbation
 """
 
 import torch
 from torch import Tensor, nn
 
-from sigmaslam_filters.core.plain_factors import cholesky
 from sigmaslam_filters.core.sigma_points import cubature
 from sigmaslam_filters.core.transforms import Unscented
 from sigmaslam_filters.graphs.exact_operators import ExactOperators
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3, skew
 
 POSE, VELOCITY, GRAVITY = slice(0, 6), slice(6, 9), slice(9, 12)
-BIASES_AND_DELAY, MOUNTING = slice(12, 19), slice(19, 25)
-STATE_SIZE = 25
+BIASES_TO_FACTORS, MOUNTING = slice(12, 37), slice(37, 43)
+STATE_SIZE = 43
 
 
 class InertialPredict(nn.Module):
     """Unscented prediction through a preintegrated motion (Forster et al. 2017, eqs. 26, 37 and 44).
 
     Shapes:
-        pose (4, 4), velocity (3,), gravity (3,), mounting (4, 4), covariance (25, 25), seconds (); turn (3, 3),
-        velocity_change (3,), position_change (3,), slope (9, 7), noise (9, 9) as of
+        pose (4, 4), velocity (3,), gravity (3,), mounting (4, 4), root (43, 43) of the covariance, seconds (); turn
+        (3, 3), velocity_change (3,), position_change (3,), slope (9, 25), noise (9, 9) as of
         `sigmaslam.estimation.preintegration`; walk (2,) power spectra of the biases' random walks -> predicted pose
-        (4, 4), velocity (3,), covariance (25, 25), and covariance (25, 25) of the state before with the one after; all
-        float64. The covariance may be singular.
+        (4, 4), velocity (3,), covariance (43, 43), and covariance (43, 43) of the state before with the one after; all
+        float64. The root may be singular: a graph takes 3 ms for one of its own.
     """
 
     def forward(
@@ -40,7 +40,7 @@ class InertialPredict(nn.Module):
         velocity: Tensor,
         gravity: Tensor,
         mounting: Tensor,
-        covariance: Tensor,
+        root: Tensor,
         seconds: Tensor,
         turn: Tensor,
         velocity_change: Tensor,
@@ -54,7 +54,7 @@ class InertialPredict(nn.Module):
         def advance(offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             mount = exp_se3(offsets[:, MOUNTING]) @ mounting
             body = exp_se3(offsets[:, POSE]) @ pose @ mount
-            change = offsets[:, BIASES_AND_DELAY] @ slope.transpose(0, 1)
+            change = offsets[:, BIASES_TO_FACTORS] @ slope.transpose(0, 1)
             R, p = body[:, :3, :3], body[:, :3, 3]
             v, g = velocity + offsets[:, VELOCITY], gravity + offsets[:, GRAVITY]
             gained = (R @ (velocity_change + change[:, 3:6]).unsqueeze(-1)).squeeze(-1)
@@ -65,7 +65,7 @@ class InertialPredict(nn.Module):
             after = torch.cat([top, body[:, 3:]], dim=-2)
             return after @ invert_se3(mount), v + g * seconds + gained, after
 
-        origin = torch.zeros_like(covariance[:1])
+        origin = torch.zeros_like(root[:1])
         predicted, speed, body = (each[0] for each in advance(origin))
         back = invert_se3(predicted)
 
@@ -74,7 +74,6 @@ class InertialPredict(nn.Module):
             return torch.cat([log_se3(camera @ back), v - speed, offsets[:, 9:]], dim=-1)
 
         with ExactOperators():
-            root = cholesky(covariance)[0]
             state = Unscented(cubature())(moved, root, None)
             mean, spread = state.mean, state.columns.covariance()
             carried = root @ state.columns.odd.transpose(0, 1)
@@ -84,7 +83,7 @@ class InertialPredict(nn.Module):
 
 
 def _process_noise(R: Tensor, body: Tensor, noise: Tensor, walk: Tensor) -> Tensor:
-    """(25, 25) of noise in the sensor's frames: turns from the right at the end, the others at the start."""
+    """(43, 43) of noise in the sensor's frames: turns from the right at the end, the others at the start."""
     zero = torch.zeros_like(R)
     turned = body[:3, :3]
     rows = torch.cat(

@@ -5,7 +5,7 @@ import torch
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3
 from sigmaslam_models.estimator.estimator_export import _inertial_example
 from sigmaslam_models.estimator.inertial_prediction import (
-    BIASES_AND_DELAY,
+    BIASES_TO_FACTORS,
     GRAVITY,
     MOUNTING,
     POSE,
@@ -21,11 +21,12 @@ def test_prediction_agrees_with_monte_carlo():
     """Of the state, and of the noise of the preintegrated motion."""
     example = list(_inertial_example(3))
     example[8], example[9] = 0.3 * example[8], 0.1 * example[9]
-    pose, velocity, gravity, mounting, covariance, seconds, turn, dv, dp, slope, noise, walk = example
+    pose, velocity, gravity, mounting, root, seconds, turn, dv, dp, slope, noise, walk = example
     count = 200_000
-    offsets = random_numbers(count, STATE_SIZE, seed=1) @ torch.linalg.cholesky(covariance).T
+    covariance = root @ root.T
+    offsets = random_numbers(count, STATE_SIZE, seed=1) @ root.T
     error = random_numbers(count, 9, seed=2) @ torch.linalg.cholesky(noise + 1e-18 * torch.eye(9)).T
-    change = offsets[:, BIASES_AND_DELAY] @ slope.T
+    change = offsets[:, BIASES_TO_FACTORS] @ slope.T
     mount = exp_se3(offsets[:, MOUNTING]) @ mounting
     body = exp_se3(offsets[:, POSE]) @ pose @ mount
     R, v, g = body[:, :3, :3], velocity + offsets[:, VELOCITY], gravity + offsets[:, GRAVITY]
@@ -58,7 +59,7 @@ def test_free_fall_without_uncertainty_is_a_parabola():
     eye, zero = torch.eye(4, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     example[0], example[3], example[6] = eye, eye, eye[:3, :3]
     example[1], example[2] = torch.tensor([1.0, 0, 0]).double(), torch.tensor([0, 9.8, 0]).double()
-    example[4], example[5] = torch.zeros(25, 25).double(), torch.tensor(0.5).double()
+    example[4], example[5] = torch.zeros(43, 43).double(), torch.tensor(0.5).double()
     example[7] = example[8] = zero
     example[10] = torch.zeros(9, 9).double()
     pose, velocity, covariance, _ = InertialPredict()(*example)

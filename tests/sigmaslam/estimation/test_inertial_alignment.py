@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sigmaslam.estimation.inertial_alignment import Alignment, align
+from sigmaslam.estimation.inertial_alignment import Alignment, _solve, align
 from sigmaslam.estimation.preintegration import preintegrate
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import se3_exp
@@ -26,7 +26,21 @@ def align_noisy(seed: int, force: float = 1.0) -> tuple[Alignment | None, np.nda
         for start, end in pairwise(TIMES)
     ]
     assert all(motions)
-    return align(poses, np.eye(4), motions, np.full(7, 1e-6)), GRAVITY
+    return align(poses, np.eye(4), motions, np.full(25, 1e-6)), GRAVITY
+
+
+def test_errors_of_the_sensor_move_gravity_as_the_slope_says():
+    motion = Motion(3, size=0.1)
+    samples = motion.measure(np.arange(-0.02, 1.2, 0.005))
+    motions = [preintegrate(samples, *span, np.zeros(3), np.zeros(3), SENSOR, np.zeros(2)) for span in pairwise(TIMES)]
+    bodies, step = motion.poses(TIMES), 1e-4
+    slope = _solve(bodies, motions)[3]
+    for k in range(19):
+        sides = [
+            _solve(bodies, [each.corrected(side * step * np.eye(25)[6 + k]) for each in motions])[0]
+            for side in (1.0, -1.0)
+        ]
+        np.testing.assert_allclose(slope[:, k], (sides[0] - sides[1]) / (2 * step), rtol=0.02, atol=2e-3)
 
 
 @pytest.mark.long

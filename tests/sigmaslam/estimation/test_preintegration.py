@@ -45,13 +45,18 @@ def test_two_parts_are_the_whole():
     np.testing.assert_allclose(position, whole.position, atol=1e-12)
 
 
-def test_bias_and_delay_corrections_are_those_of_integrating_again():
+def test_corrections_of_bias_delay_and_factors_are_those_of_integrating_again():
     motion = Motion(2)
     samples = motion.measure(np.arange(0, 2, 0.005))
     first, gyro, accel = integrate(samples, 0.5, 1.0), np.array([0.02, -0.015, 0.01]), np.array([0.1, -0.05, 0.08])
+    factors, zero = 5e-3 * np.random.default_rng(5).normal(size=(2, 3, 3)), np.zeros(18)
+    scaled = InertialSamples(
+        samples.timestamp, samples.gyro - samples.gyro @ factors[0].T, samples.accel - samples.accel @ factors[1].T
+    )
     changed = [
-        (integrate(samples, 0.5, 1.0, gyro, accel), np.r_[gyro, accel, 0.0]),
-        (integrate(samples, 0.5002, 1.0002), np.r_[np.zeros(6), 2e-4]),
+        (integrate(samples, 0.5, 1.0, gyro, accel), np.r_[gyro, accel, 0.0, zero]),
+        (integrate(samples, 0.5002, 1.0002), np.r_[np.zeros(6), 2e-4, zero]),
+        (integrate(scaled, 0.5, 1.0), np.r_[np.zeros(7), factors.ravel()]),
     ]
     for again, change in changed:
         moved = first.slope @ change
