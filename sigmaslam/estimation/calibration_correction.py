@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sigmaslam.estimation.calibration_errors import ERRORS, TURNS
-from sigmaslam.estimation.calibration_evidence import HYPOTHESES, CalibrationEvidence, Cause
+from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, TURNS
+from sigmaslam.estimation.calibration_evidence import HYPOTHESES, CalibrationEvidence
 
 if TYPE_CHECKING:
     from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 _CREDIBLE = 4.0
 # Boards are held within arm's reach: there depths are right, whatever else a calibration has wrong, metres.
 _REACH = 0.5
+_BASELINE = np.array([ERRORS.index("baseline")])
 
 
 def change_rig(window: KeyframeWindow, offset: float) -> None:
@@ -50,31 +51,29 @@ def judge_calibration(window: KeyframeWindow) -> None:
     if not window.exceeded[0]:
         if window.board_disparity is not None:
             window.board_disparity = None
-            _set_error(window, ERRORS.index("baseline"), 0.0, 0.0)
+            _set_errors(window, _BASELINE, np.zeros(1), np.zeros(1))
     elif held is not None and (window.board_disparity is None or window.held_offset != before):
         _move_baseline(window, held - float(window.expected[0]))
     window.worse = window.evidence.worse_by(window.causes)
 
 
 def _correct_calibration(window: KeyframeWindow) -> None:
-    """Moves considered errors to the mean of all hypotheses, and makes them as uncertain as these differ.
+    """Moves considered errors to what images show of all of them together, and widens those that causes move.
 
-    Where nothing is wrong an error is zero, and as uncertain as usual, as poses come out best so. The disparity offset
-    is estimated anyway; it is expected where a yaw has it.
+    One error alone would stand for others, too. The disparity offset is estimated anyway; it is expected where a yaw
+    has it.
     """
     window.causes = window.evidence.weigh()
     window.expected = window.evidence.expected.copy()
-    for name, moved in HYPOTHESES.items():
-        k = ERRORS.index(name)
-        if window.calibration.estimated[k] or window.calibration.sigma[k] == 0.0:
-            continue
-        cause = window.causes.get(name, Cause())
-        mean = cause.probability * cause.mean
-        spread = np.sqrt(cause.probability * (cause.variance + cause.mean**2) - mean**2)
-        if (window.corrected[:, k] != (mean, spread)).any():
-            _set_error(window, k, mean, spread)
-        if "offset" in moved:
-            window.expected[0] += mean
+    means, spreads = window.evidence.expected_errors(window.causes), np.zeros(len(ERRORS))
+    for name, cause in window.causes.items():
+        of_cause = cause.probability * cause.mean
+        spread = cause.probability * (cause.variance + cause.mean**2) - of_cause**2
+        spreads[ERRORS.index(name)] = np.sqrt(spread)
+        if name != "offset" and "offset" in HYPOTHESES[name]:
+            window.expected[0] += of_cause
+    moves = np.isin(ERRORS, SHOWN) & ~window.calibration.estimated & (window.calibration.sigma > 0.0)
+    _set_errors(window, np.flatnonzero(moves), means[moves], spreads[moves])
 
 
 def _move_baseline(window: KeyframeWindow, offset: float) -> None:
@@ -82,16 +81,16 @@ def _move_baseline(window: KeyframeWindow, offset: float) -> None:
     if window.board_disparity is None:
         seen = float(np.median(window.landmarks.estimate[:, 2]))
         window.board_disparity = max(window.camera.focal_baseline / _REACH, seen)
-    change = -offset / window.board_disparity
-    _set_error(window, ERRORS.index("baseline"), change, change)
+    change = np.array([-offset / window.board_disparity])
+    _set_errors(window, _BASELINE, change, change)
 
 
-def _set_error(window: KeyframeWindow, index: int, mean: float, spread: float) -> None:
-    """Gives a considered error another mean, and a standard deviation more beside its usual one."""
+def _set_errors(window: KeyframeWindow, index: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> None:
+    """Gives considered errors other means (K,), and standard deviations (K,) more beside their usual ones."""
     variance = window.calibration.covariance.copy()
     variance[index, index] += spread**2 - window.corrected[1, index] ** 2
     after = replace(window.calibration, covariance=variance)
-    window.prior, _ = window.prior.with_error(index, mean, window.calibration, after)
-    window.posterior, step = window.posterior.with_error(index, mean, window.calibration, after)
+    window.prior, _ = window.prior.with_errors(index, mean, window.calibration, after)
+    window.posterior, step = window.posterior.with_errors(index, mean, window.calibration, after)
     window.landmarks.estimate += window.landmarks.dependence @ step
     window.calibration, window.corrected[:, index] = after, (mean, spread)

@@ -134,8 +134,7 @@ class CalibrationEvidence:
         identity = np.eye(len(ERRORS))
         mean, _, precision = self._in_usual_sigmas()
         vector, information = precision @ mean / _ALIKE, (precision - identity) / _ALIKE
-        spreads = [np.sqrt(cause.probability) * self._spread(name) for name, cause in causes.items()]
-        beside = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
+        beside = self._beside(causes)
         grows = np.isin(ERRORS, SHOWN) & self._is_uncertain
         likelihoods = []
         for factor in _WORSE:
@@ -145,10 +144,23 @@ class CalibrationEvidence:
             likelihoods.append(squared - np.linalg.slogdet(seen)[1])
         return float(_WORSE[int(np.argmax(likelihoods))])
 
+    def expected_errors(self, causes: dict[str, Cause]) -> np.ndarray:
+        """(15,) errors that images show, all together, beside these causes; views count by a part."""
+        mean, _, precision = self._in_usual_sigmas()
+        vector, information = precision @ mean / _ALIKE, (precision - np.eye(len(ERRORS))) / _ALIKE
+        prior = np.eye(len(ERRORS)) + self._beside(causes)
+        found = prior @ np.linalg.solve(np.eye(len(ERRORS)) + information @ prior, vector)
+        return np.where(np.isin(ERRORS, SHOWN) & self._is_uncertain, found * self._sigma, 0.0)
+
     def _in_usual_sigmas(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean (15,), covariance and precision (15, 15) of the errors in the usual sigmas: S is the identity there."""
         covariance = self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(self._sigma, self._sigma)
         return (self._posterior.calibration - self.expected) / self._sigma, covariance, np.linalg.inv(covariance)
+
+    def _beside(self, causes: dict[str, Cause]) -> np.ndarray:
+        """(15, 15) covariance that causes add to the usual one, in the usual sigmas."""
+        spreads = [np.sqrt(cause.probability) * self._spread(name) for name, cause in causes.items()]
+        return sum((np.outer(each, each) for each in spreads), np.zeros((len(ERRORS), len(ERRORS))))
 
     def _spread(self, name: str) -> np.ndarray:
         """(15,) standard deviation times direction of a hypothesis, in the usual sigmas: s w."""

@@ -82,14 +82,14 @@ class WindowState:
         step, covariance, common = condition(learned)
         return replace(self.moved(step, covariance, common), past=past)
 
-    def with_error(
-        self, index: int, value: float, before: CalibrationPrior, after: CalibrationPrior
+    def with_errors(
+        self, index: np.ndarray, value: np.ndarray, before: CalibrationPrior, after: CalibrationPrior
     ) -> tuple[WindowState, np.ndarray]:
-        """As if a considered error of the calibration had another mean, and all of them another covariance.
+        """As if considered errors of the calibration had other means, and all of them another covariance.
 
         Args:
-            index: in `calibration_errors.ERRORS`.
-            value: its mean.
+            index: (K,) in `calibration_errors.ERRORS`.
+            value: (K,) their means.
             before, after: prior of the errors.
         Returns:
             The state, and its step (n,).
@@ -97,9 +97,9 @@ class WindowState:
         by_error = np.linalg.pinv(before.considered_factor)
         slope, past_slope = self.common @ by_error[:, index], self.past.common @ by_error[:, index]
         change, to_factor = value - self.calibration[index], by_error @ after.considered_factor
-        past_step, past_common = change * past_slope, self.past.common @ to_factor
+        past_step, past_common = past_slope @ change, self.past.common @ to_factor
         past = self.past.moved(past_step, self.past.covariance, self.past.cross, past_common)
-        step = change * slope
+        step = slope @ change
         return replace(self.moved(step, self.covariance, self.common @ to_factor), past=past), step
 
     def grow(

@@ -58,6 +58,20 @@ def test_probabilities_and_errors_are_those_of_the_measurements(name: str, size:
     assert hopeless < 0.05 * len(HYPOTHESES) * sum(densities.values())
 
 
+@pytest.mark.parametrize("cause", [None, "yaw"])
+def test_expected_errors_are_those_of_all_measurements_together(cause: str | None):
+    slopes, measured = measurements(3, "yaw", 0.6)
+    evidence = CalibrationEvidence(USUAL, CAMERA.fx, load_step("window_condition"))
+    evidence.learn(WindowState.initial(USUAL), slopes.T @ slopes / NOISE**2, slopes.T @ measured / NOISE**2)
+    prior = USUAL.covariance.copy()
+    if cause is not None:
+        prior += 0.5 * SIZE**2 * np.outer(*2 * [np.isin(ERRORS, HYPOTHESES[cause]).astype(float)])
+    # What views say counts a part.
+    gain = prior @ slopes.T @ np.linalg.inv(slopes @ prior @ slopes.T + _ALIKE * NOISE**2 * np.eye(COUNT))
+    found = evidence.expected_errors({} if cause is None else {cause: Cause(0.5, 0.6, 0.1)})
+    np.testing.assert_allclose(found, np.where(np.isin(ERRORS, SHOWN), gain @ measured, 0.0), rtol=1e-6, atol=1e-12)
+
+
 def test_nothing_is_wrong_until_evidence_speaks():
     assert weigh(np.zeros((COUNT, len(ERRORS))), np.zeros(COUNT)) == {}
     silent = [weigh(*measurements(seed, "yaw", 0.0)) for seed in range(40)]
@@ -94,8 +108,10 @@ def test_a_window_takes_over_what_evidence_names(name: str):
     right, wrong = (unsolved(each, considered_sigma=CONSIDERED_SIGMA) for each in (given, by_pair_with(given, error)))
     right.solve()
     assert right.causes == {}
-    np.testing.assert_allclose(right.posterior.calibration[3:], 0.0, atol=1e-15)
-    assert not right.corrected.any()
+    # Images know no better than calibrations usually are.
+    np.testing.assert_allclose(right.posterior.calibration[3:], right.corrected[0, 3:], atol=1e-12)
+    assert (np.abs(right.corrected[0]) <= USUAL.sigma).all()
+    assert not right.corrected[1].any()
     wrong.solve()
     assert wrong.causes[name].probability > 0.95
     # What was linearised about no error, is so about most of it the next time.

@@ -15,6 +15,7 @@ import pytest
 from scipy.stats import chi2
 
 from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, CalibrationPrior
+from sigmaslam.estimation.calibration_evidence import CalibrationEvidence
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
@@ -103,6 +104,12 @@ def views_of_last(given: World) -> LandmarkViews:
     """What the frame sees of the last keyframe's landmarks, by their rows where there are no others."""
     views, of_last = given.views[-1], given.host == KEYFRAMES - 1
     return views.select(of_last[views.landmark]).renumber(np.where(of_last, np.cumsum(of_last) - 1, -1))
+
+
+@pytest.fixture(autouse=True)
+def no_error_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`common` is of errors that nothing tells, and that the window therefore leaves as they are."""
+    monkeypatch.setattr(CalibrationEvidence, "expected_errors", lambda evidence, causes: np.zeros(CALIBRATION_SIZE))
 
 
 BUILDS: dict[str, Build] = {"window": whole, "past": moving_on, "loop": with_loop}
