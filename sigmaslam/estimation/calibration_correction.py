@@ -54,7 +54,6 @@ def judge_calibration(window: KeyframeWindow) -> None:
             _set_errors(window, _BASELINE, np.zeros(1), np.zeros(1))
     elif held is not None and (window.board_disparity is None or window.held_offset != before):
         _move_baseline(window, held - float(window.expected[0]))
-    window.worse = window.evidence.worse_by(window.causes)
 
 
 def _correct_calibration(window: KeyframeWindow) -> None:
@@ -65,7 +64,8 @@ def _correct_calibration(window: KeyframeWindow) -> None:
     """
     window.causes = window.evidence.weigh()
     window.expected = window.evidence.expected.copy()
-    means, spreads = window.evidence.expected_errors(window.causes), np.zeros(len(ERRORS))
+    means, window.worse = window.evidence.beside(window.causes)
+    spreads = np.zeros(len(ERRORS))
     for name, cause in window.causes.items():
         of_cause = cause.probability * cause.mean
         spread = cause.probability * (cause.variance + cause.mean**2) - of_cause**2

@@ -78,7 +78,9 @@ class CalibrationEvidence:
         units = np.where(np.isin(ERRORS, ("focal", "baseline")), 1.0, focal_length)
         self._sigma = np.maximum(usual.sigma, _LEAST_SIGMA * units)
         self._is_uncertain = usual.sigma > 0.0
-        self._size = _SIZE * focal_length
+        # Standard deviation times direction of a hypothesis, in the usual sigmas: s w.
+        size = _SIZE * focal_length / self._sigma
+        self._spreads = {name: size * np.isin(ERRORS, moved) for name, moved in HYPOTHESES.items()}
         self._condition = condition
         self.expected = np.zeros(len(ERRORS)) if expected is None else expected.copy()
         state = WindowState.initial(CalibrationPrior.independent(self._sigma, *ERRORS))
@@ -117,7 +119,7 @@ class CalibrationEvidence:
         mean, covariance, precision = self._in_usual_sigmas()
         found: dict[str, tuple[float, float, float]] = {}
         for name in HYPOTHESES:
-            spread = self._spread(name)
+            spread = self._spreads[name]
             growth = 1.0 + spread @ (usual - covariance) @ spread
             ratio = 0.5 * ((spread @ mean) ** 2 / growth - np.log(growth))
             k, own = ERRORS.index(name), np.linalg.inv(usual + np.outer(spread, spread))
@@ -129,39 +131,27 @@ class CalibrationEvidence:
         total = (1.0 - _PRIOR * len(found)) * np.exp(-top) + sum(weights.values())
         return {k: Cause(odds / total, *found[k][1:]) for k, odds in weights.items() if odds > _HOPELESS * total}
 
-    def worse_by(self, causes: dict[str, Cause]) -> float:
-        """By what factor errors that images show are larger than usual beside these causes; 1 or more."""
+    def beside(self, causes: dict[str, Cause]) -> tuple[np.ndarray, float]:
+        """What images show of all errors together beside these causes; views count by a part.
+
+        Returns:
+            (15,) the errors that they show, by the usual sigmas; by what factor these errors are larger, 1 or more.
+        """
         identity = np.eye(len(ERRORS))
         mean, _, precision = self._in_usual_sigmas()
         vector, information = precision @ mean / _ALIKE, (precision - identity) / _ALIKE
-        beside = self._beside(causes)
-        grows = np.isin(ERRORS, SHOWN) & self._is_uncertain
-        likelihoods = []
+        spreads = [np.sqrt(cause.probability) * self._spreads[name] for name, cause in causes.items()]
+        more = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
+        shown = np.isin(ERRORS, SHOWN) & self._is_uncertain
+        errors, likelihoods = [], []
         for factor in _WORSE:
-            prior = np.diag(np.where(grows, factor**2, 1.0)) + beside
+            prior = np.diag(np.where(shown, factor**2, 1.0)) + more
             seen = identity + prior @ information
-            squared = vector @ np.linalg.solve(seen, prior @ vector)
-            likelihoods.append(squared - np.linalg.slogdet(seen)[1])
-        return float(_WORSE[int(np.argmax(likelihoods))])
-
-    def expected_errors(self, causes: dict[str, Cause]) -> np.ndarray:
-        """(15,) errors that images show, all together, beside these causes; views count by a part."""
-        mean, _, precision = self._in_usual_sigmas()
-        vector, information = precision @ mean / _ALIKE, (precision - np.eye(len(ERRORS))) / _ALIKE
-        prior = np.eye(len(ERRORS)) + self._beside(causes)
-        found = prior @ np.linalg.solve(np.eye(len(ERRORS)) + information @ prior, vector)
-        return np.where(np.isin(ERRORS, SHOWN) & self._is_uncertain, found * self._sigma, 0.0)
+            errors.append(np.linalg.solve(seen, prior @ vector))
+            likelihoods.append(vector @ errors[-1] - np.linalg.slogdet(seen)[1])
+        return np.where(shown, errors[0] * self._sigma, 0.0), float(_WORSE[int(np.argmax(likelihoods))])
 
     def _in_usual_sigmas(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean (15,), covariance and precision (15, 15) of the errors in the usual sigmas: S is the identity there."""
         covariance = self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(self._sigma, self._sigma)
         return (self._posterior.calibration - self.expected) / self._sigma, covariance, np.linalg.inv(covariance)
-
-    def _beside(self, causes: dict[str, Cause]) -> np.ndarray:
-        """(15, 15) covariance that causes add to the usual one, in the usual sigmas."""
-        spreads = [np.sqrt(cause.probability) * self._spread(name) for name, cause in causes.items()]
-        return sum((np.outer(each, each) for each in spreads), np.zeros((len(ERRORS), len(ERRORS))))
-
-    def _spread(self, name: str) -> np.ndarray:
-        """(15,) standard deviation times direction of a hypothesis, in the usual sigmas: s w."""
-        return np.asarray(self._size * np.isin(ERRORS, HYPOTHESES[name]) / self._sigma)

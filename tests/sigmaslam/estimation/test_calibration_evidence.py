@@ -68,7 +68,7 @@ def test_expected_errors_are_those_of_all_measurements_together(cause: str | Non
         prior += 0.5 * SIZE**2 * np.outer(*2 * [np.isin(ERRORS, HYPOTHESES[cause]).astype(float)])
     # What views say counts a part.
     gain = prior @ slopes.T @ np.linalg.inv(slopes @ prior @ slopes.T + _ALIKE * NOISE**2 * np.eye(COUNT))
-    found = evidence.expected_errors({} if cause is None else {cause: Cause(0.5, 0.6, 0.1)})
+    found, _ = evidence.beside({} if cause is None else {cause: Cause(0.5, 0.6, 0.1)})
     np.testing.assert_allclose(found, np.where(np.isin(ERRORS, SHOWN), gain @ measured, 0.0), rtol=1e-6, atol=1e-12)
 
 
@@ -153,9 +153,9 @@ def test_errors_of_a_bad_calibration_are_as_much_larger_as_their_likelihood_says
             ).logpdf(measured)
             for each in _WORSE
         ]
-        found.append(evidence.worse_by({}))
+        found.append(evidence.beside({})[1])
         assert found[-1] == _WORSE[np.argmax(densities)]
     assert np.median(found) == pytest.approx(worse, rel=0.25)
     # A covariance that claims to be exact leaves nothing to be larger.
     exact = CalibrationPrior.independent(np.r_[0.5, np.zeros(len(ERRORS) - 1)], "offset")
-    assert CalibrationEvidence(exact, CAMERA.fx, load_step("window_condition")).worse_by({}) == 1.0
+    assert CalibrationEvidence(exact, CAMERA.fx, load_step("window_condition")).beside({})[1] == 1.0
