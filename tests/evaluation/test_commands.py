@@ -24,9 +24,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """What `write_features` was called with."""
     taken: list[dict[str, Any]] = []
 
-    def write_features(
-        path, figure, data, weights, peers, workers, command, sets="all of them", rounds=1
-    ):
+    def write_features(path, figure, data, weights, peers, workers, command, sets="all of them", rounds=1):
         taken.append(locals())
         return "the page"
 
