@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.quantiles import chi_square_quantile
@@ -105,18 +106,26 @@ def test_coverage_over_sixty_worlds(kind: str, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", SCALES)
-def test_errors_of_the_calibration_widen_the_covariance_and_nothing_else(kind: str):
-    """The same frames by a calibration without errors, of which views are left, and by one as good as most."""
+def test_errors_of_the_calibration_widen_the_covariance_and_move_poses_within_it(kind: str):
+    """The same frames by a calibration without errors, of which views are left, and by one as good as most.
+
+    Errors that images seem to show are noise here.
+    """
     scale, runs = SCALES[kind], []
     for sigmas in (CalibrationSigmas.none(), CalibrationSigmas()):
         frontend = SimulatedFrontend(scale, 0, 25, offset=OFFSET)
         tracker = StereoTracker(replace(frontend.camera, sigmas=sigmas), frontend)
         runs.append(run_simulated(tracker, frontend, scale).estimates)
     for exact, usual in zip(*runs, strict=True):
-        np.testing.assert_allclose(usual.T_world_camera, exact.T_world_camera, atol=1e-9)
-        np.testing.assert_allclose(usual.matching_covariance, exact.matching_covariance, rtol=1e-6, atol=1e-15)
-        assert usual.calibration.disparity_offset == pytest.approx(exact.calibration.disparity_offset, abs=1e-9)
-        for less, more in ((exact.matching_covariance, exact.covariance), (exact.covariance, usual.covariance)):
-            assert np.linalg.eigvalsh(more - less)[0] >= -1e-6 * np.trace(more)
+        departure = se3_log(se3_inverse(exact.T_world_camera) @ usual.T_world_camera)
+        # A third of a sigma, with six degrees of freedom.
+        assert departure @ np.linalg.lstsq(usual.covariance, departure)[0] < 0.1
+        departure = usual.calibration.disparity_offset - exact.calibration.disparity_offset
+        assert abs(departure) < 0.3 * usual.calibration.disparity_offset_sigma
+        for each in (exact, usual):
+            assert np.linalg.eigvalsh(each.covariance - each.matching_covariance)[0] >= -1e-6 * np.trace(
+                each.covariance
+            )
+        assert np.linalg.eigvalsh(usual.covariance - exact.covariance)[0] >= -1e-6 * np.trace(usual.covariance)
     np.testing.assert_array_equal(runs[1][0].covariance, runs[1][0].matching_covariance)  # the first one is the world
     assert np.trace(runs[1][-1].covariance[:3, :3]) > 1.1 * np.trace(runs[0][-1].covariance[:3, :3])
