@@ -186,7 +186,9 @@ def _build(builder: Path, kind: str, sources: Path, out: Path, environment: dict
 
 def _unpack(archive: bytes, folder: Path) -> None:
     with tarfile.open(fileobj=io.BytesIO(archive), mode="r:") as source:
-        source.extractall(folder, filter="tar")
+        # Python before 3.11.4 has no filters.
+        source.extraction_filter = getattr(tarfile, "tar_filter", None)
+        source.extractall(folder)
 
 
 def _git(*arguments: str) -> bytes:
