@@ -90,7 +90,9 @@ def _set_errors(window: KeyframeWindow, index: np.ndarray, mean: np.ndarray, spr
     variance = window.calibration.covariance.copy()
     variance[index, index] += spread**2 - window.corrected[1, index] ** 2
     after = replace(window.calibration, covariance=variance)
-    window.prior, _ = window.prior.with_errors(index, mean, window.calibration, after)
-    window.posterior, step = window.posterior.with_errors(index, mean, window.calibration, after)
+    by_error = np.linalg.pinv(window.calibration.considered_factor)
+    to_factor = by_error @ after.considered_factor
+    window.prior, _ = window.prior.with_errors(index, mean, by_error, to_factor)
+    window.posterior, step = window.posterior.with_errors(index, mean, by_error, to_factor)
     window.landmarks.estimate += window.landmarks.dependence @ step
     window.calibration, window.corrected[:, index] = after, (mean, spread)

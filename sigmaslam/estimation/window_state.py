@@ -83,20 +83,20 @@ class WindowState:
         return replace(self.moved(step, covariance, common), past=past)
 
     def with_errors(
-        self, index: np.ndarray, value: np.ndarray, before: CalibrationPrior, after: CalibrationPrior
+        self, index: np.ndarray, value: np.ndarray, by_error: np.ndarray, to_factor: np.ndarray
     ) -> tuple[WindowState, np.ndarray]:
         """As if considered errors of the calibration had other means, and all of them another covariance.
 
         Args:
             index: (K,) in `calibration_errors.ERRORS`.
             value: (K,) their means.
-            before, after: prior of the errors.
+            by_error: (15, 15) inverse of the factor of their covariance, `considered_factor`.
+            to_factor: (15, 15) that by the factor of the other covariance.
         Returns:
             The state, and its step (n,).
         """
-        by_error = np.linalg.pinv(before.considered_factor)
         slope, past_slope = self.common @ by_error[:, index], self.past.common @ by_error[:, index]
-        change, to_factor = value - self.calibration[index], by_error @ after.considered_factor
+        change = value - self.calibration[index]
         past_step, past_common = past_slope @ change, self.past.common @ to_factor
         past = self.past.moved(past_step, self.past.covariance, self.past.cross, past_common)
         step = slope @ change

@@ -224,7 +224,9 @@ def test_another_baseline_moves_poses_as_a_considered_one_would():
     state = replace(state, common=np.c_[np.zeros(len(state.common)), state.common[:, 1:]])
     wider = prior.widened(np.isin(ERRORS, "baseline") * 0.05)
     baseline = ERRORS.index("baseline")
-    after, step = state.with_errors(np.array([baseline]), np.array([0.05]), prior, wider)
+    by_error = np.linalg.pinv(prior.considered_factor)
+    to_factor = by_error @ wider.considered_factor
+    after, step = state.with_errors(np.array([baseline]), np.array([0.05]), by_error, to_factor)
     expected = state.common[:, baseline] / 0.001
     np.testing.assert_allclose(step, expected * (0.05 - state.calibration[baseline]), rtol=1e-9)
     np.testing.assert_allclose(after.minus(state), step, atol=1e-9 * np.abs(step).max())
