@@ -32,7 +32,7 @@ NAMES = {"sigmaslam_training", "sigmaslam_training.mixes", "sigmaslam_synthetic"
 # All rooms from the ground up: a room imports only from floors below its own. A room is a folder of the run time, or
 # a package beside it.
 FLOORS = (
-    ("sigmaslam", "errors", "table", "sigmaslam_filters", "sigmaslam_weights"),
+    ("sigmaslam", "compiled", "errors", "table", "sigmaslam_filters", "sigmaslam_weights"),
     ("bounded_files", "files", "progress", "plot_style", "source_commit", "filters"),
     ("geometry",),
     ("inference", "calibration_files"),
