@@ -222,6 +222,15 @@ def test_the_filters_load_neither_opencv_nor_onnxruntime(module: str):
     assert not loaded & {"cv2", "onnxruntime", "sigmaslam"}
 
 
+@pytest.mark.long
+def test_a_tracker_loads_neither_readers_nor_sensors():
+    code = "import sys, sigmaslam.slam.tracker; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    late = {f"sigmaslam.{name}" for name in ("readers", "estimation.inertial_motion", "estimation.odometry_motion")}
+    assert "sigmaslam.inference.session" in done.stdout.split()
+    assert not late & set(done.stdout.split())
+
+
 def test_every_public_name_of_the_package_is_there():
     for name in sigmaslam.__all__:
         assert getattr(sigmaslam, name).__name__ == name
