@@ -13,10 +13,8 @@ endif
 endif
 
 # What an installation is made of: when one of these changes, it is made again.
-BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock sigmaslam/both_ways.inc \
-         sigmaslam/frontend/kernels.cpp sigmaslam/frontend/kernels.inc sigmaslam/estimation/estimator.cpp \
-         sigmaslam/estimation/estimator.inc sigmaslam/estimation/views.inc \
-         sigmaslam/reconstruction/depths.cpp sigmaslam/reconstruction/depths.inc
+BUILD := pyproject.toml evaluation/pyproject.toml setup.py requirements.lock \
+         $(wildcard sigmaslam/*.hpp sigmaslam/*.inc sigmaslam/*/*.cpp sigmaslam/*/*.inc)
 
 .PHONY: demo test test-long test-slow lint docs results dist publish wheel sbom clean
 

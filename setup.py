@@ -19,7 +19,7 @@ def compiled(name: str, folder: str, source: str, included: list[str], optimised
     return Extension(
         name,
         [f"{folder}/{source}"],
-        depends=["sigmaslam/both_ways.inc", *(f"{folder}/{each}" for each in included)],
+        depends=["sigmaslam/both_ways.inc", "sigmaslam/compiled.hpp", *(f"{folder}/{each}" for each in included)],
         include_dirs=[pybind11.get_include()],
         # Nothing is shared between modules: zig links a C++ library to each, which knows its own exceptions alone.
         define_macros=[("PYBIND11_STDLIB", f'"_sigmaslam{name.rpartition(".")[2]}"')],

@@ -32,7 +32,7 @@ NAMES = {"sigmaslam_training", "sigmaslam_training.mixes", "sigmaslam_synthetic"
 # All rooms from the ground up: a room imports only from floors below its own. A room is a folder of the run time, or
 # a package beside it.
 FLOORS = (
-    ("sigmaslam", "errors", "table", "sigmaslam_filters", "sigmaslam_weights"),
+    ("sigmaslam", "compiled", "errors", "table", "sigmaslam_filters", "sigmaslam_weights"),
     ("bounded_files", "files", "progress", "plot_style", "source_commit", "filters"),
     ("geometry",),
     ("inference", "calibration_files"),
@@ -220,6 +220,15 @@ def test_the_filters_load_neither_opencv_nor_onnxruntime(module: str):
     loaded = set(done.stdout.split())
     assert {"sigmaslam_filters", "torch"} <= loaded
     assert not loaded & {"cv2", "onnxruntime", "sigmaslam"}
+
+
+@pytest.mark.long
+def test_a_tracker_loads_neither_readers_nor_sensors():
+    code = "import sys, sigmaslam.slam.tracker; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    late = {f"sigmaslam.{name}" for name in ("readers", "estimation.inertial_motion", "estimation.odometry_motion")}
+    assert "sigmaslam.inference.session" in done.stdout.split()
+    assert not late & set(done.stdout.split())
 
 
 def test_every_public_name_of_the_package_is_there():

@@ -165,12 +165,10 @@ class CalibrationEvidence:
         spreads = [np.sqrt(cause.probability) * self._spreads[name] for name, cause in causes.items()]
         more = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
         shown = np.isin(ERRORS, SHOWN) & self._is_uncertain
-        errors, likelihoods = [], []
-        for factor in _WORSE:
-            prior = np.diag(np.where(shown, factor**2, 1.0)) + more
-            seen = identity + prior @ information
-            errors.append(np.linalg.solve(seen, prior @ vector))
-            likelihoods.append(vector @ errors[-1] - np.linalg.slogdet(seen)[1])
+        priors = identity * np.where(shown, _WORSE[:, None] ** 2, 1.0)[:, None] + more
+        seen = identity + priors @ information
+        errors = np.linalg.solve(seen, (priors @ vector)[..., None])[..., 0]
+        likelihoods = errors @ vector - np.linalg.slogdet(seen)[1]
         return np.where(shown, errors[0] * self._sigma, 0.0), float(_WORSE[int(np.argmax(likelihoods))])
 
     def _in_usual_sigmas(self, state: WindowState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

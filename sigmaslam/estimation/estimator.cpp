@@ -3,26 +3,11 @@
 // What is done for each view is in views.inc, which is made from the torch modules that the graphs are made from; the
 // sums over views and the small solutions around it are in estimator.inc. The compiler may not contract or reorder
 // (-ffp-contract=off, no -ffast-math), and sums have a fixed order, so the bits are the same on every run.
-#include <pybind11/numpy.h>
-#include <pybind11/pybind11.h>
+#include "../compiled.hpp"
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <cstring>
-#include <numeric>
-#include <vector>
-
-#if defined(__x86_64__)
-#include <cpuid.h>
-#endif
-
-namespace py = pybind11;
-using Reals = py::array_t<double, py::array::c_style | py::array::forcecast>;
-using Flags = py::array_t<bool, py::array::c_style | py::array::forcecast>;
-using Integers = py::array_t<int64_t, py::array::c_style | py::array::forcecast>;
-
-#define INLINE inline __attribute__((always_inline))
+using Reals = Array<double>;
+using Flags = Array<bool>;
+using Integers = Array<int64_t>;
 
 namespace {
 
@@ -86,7 +71,7 @@ class Feed {
 public:
     explicit Feed(const py::dict& feed) : feed_(feed) {}
 
-    template <typename Array = Reals> auto* numbers(const char* name) { return array<Array>(name).data(); }
+    template <typename Given = Reals> auto* numbers(const char* name) { return array<Given>(name).data(); }
     double number(const char* name) { return *numbers(name); }
     bool has(const char* name) const { return feed_.contains(name); }
     int length(const char* name, int axis = 0) { return static_cast<int>(array<Reals>(name).shape(axis)); }
@@ -99,8 +84,8 @@ public:
     }
 
 private:
-    template <typename Array> Array array(const char* name) {
-        Array found = feed_[name].cast<Array>();
+    template <typename Given> Given array(const char* name) {
+        Given found = feed_[name].cast<Given>();
         kept_.append(found);
         return found;
     }

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import logging
-from functools import cache
-from importlib import import_module
-from types import ModuleType
 from typing import cast
 
 import numpy as np
 
+from sigmaslam.compiled import open_compiled, tell_slow
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.inference.backends import ONNX, load_step
 from sigmaslam.inference.onnx_graph import Step
 
-_compiled: ModuleType | None
-try:
-    _compiled = import_module("sigmaslam.estimation._estimator")
-except ImportError:  # installed without a compiler
-    _compiled = None
-
-_LOGGER = logging.getLogger(__name__)
+_compiled = open_compiled("estimation._estimator")
 
 
 class EstimatorGraphs:
@@ -58,15 +49,6 @@ def open_step(name: str, backend: str = ONNX) -> Step:
     if backend != ONNX:
         return load_step(name, backend)
     if _compiled is None or not _compiled.FAST:
-        _tell_slow()
+        tell_slow("poses are estimated by graphs, which takes four times longer")
         return load_step(name)
     return cast(Step, getattr(_compiled, name))
-
-
-@cache
-def _tell_slow() -> None:
-    """Once."""
-    _LOGGER.warning(
-        "poses are estimated by graphs, which takes four times longer: install the wheel of this Python and "
-        "platform, or a C++ compiler (without AVX2: clang) and then sigmaslam from its sources"
-    )

@@ -22,9 +22,9 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere
 from sigmaslam.frontend.rival_matches import count_rivals, share_with_rivals
-from sigmaslam.frontend.types import Features
+from sigmaslam.frontend.types import Features, check_grey
 from sigmaslam.inference.networks import WeightsFolder
-from sigmaslam.readers.images import check_grey, read_grey
+from sigmaslam.readers.images import read_grey
 from sigmaslam.table import Table
 
 DETECTORS = {"learned": LearnedDetector, "sift": SiftDetector, "orb": OrbDetector}

@@ -54,15 +54,15 @@ def gradient_moments(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """
     patches, smooth = _smooth_patches(image, places)
     gradient = [0.5 * cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=1) for axes in ((1, 0), (0, 1))]
-    moments = [float(_inner_mean(one * other, patches).mean()) for one in gradient for other in gradient]
+    uu, uv, vv = (float(_inner_mean(gradient[k] * gradient[j], patches).mean()) for k, j in ((0, 0), (0, 1), (1, 1)))
     variance = float(patches.var(axis=(1, 2)).mean())
-    return np.reshape(moments, (2, 2)) / variance if variance > 0.0 else np.full((2, 2), np.inf)
+    return np.array([[uu, uv], [uv, vv]]) / variance if variance > 0.0 else np.full((2, 2), np.inf)
 
 
 def _smooth_patches(image: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(M, S, S) grey values around places with what derivatives need, and the same smoothed, (M S, S) in one column."""
     reach = _RADIUS + _MARGIN
-    framed = np.pad(image, reach, mode="edge")
+    framed = cv2.copyMakeBorder(image, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
     windows = np.lib.stride_tricks.sliding_window_view(framed, (2 * reach + 1, 2 * reach + 1))
     patches = windows[tuple(_pixels(image, places)[:, ::-1].T)]
     # One below the other, so that one call filters all; what their margins share is cut off.

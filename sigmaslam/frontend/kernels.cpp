@@ -2,35 +2,12 @@
 //
 // Every sum has a fixed order that does not depend on the instruction set: eight partial sums, added pairwise.
 // The compiler may not contract or reorder (-ffp-contract=off, no -ffast-math), so the bits are the same on every run.
-#include <pybind11/numpy.h>
-#include <pybind11/pybind11.h>
-#include <pybind11/stl.h>
+#include "../compiled.hpp"
 
-#include <algorithm>
-#include <array>
-#include <climits>
-#include <cmath>
-#include <cstdint>
-#include <cstdlib>
-#include <cstring>
-#include <numeric>
-#include <stdexcept>
-#include <vector>
-
-#if defined(__SSE2__)
-#include <immintrin.h>
-#endif
-#if defined(__x86_64__)
-#include <cpuid.h>
-#endif
-
-namespace py = pybind11;
-using Grey = py::array_t<uint8_t, py::array::c_style | py::array::forcecast>;
-using Reals = py::array_t<double, py::array::c_style | py::array::forcecast>;
-using Steps = py::array_t<int32_t, py::array::c_style | py::array::forcecast>;
-using Places = py::array_t<float, py::array::c_style | py::array::forcecast>;
-
-#define INLINE inline __attribute__((always_inline))
+using Grey = Array<uint8_t>;
+using Reals = Array<double>;
+using Steps = Array<int32_t>;
+using Places = Array<float>;
 
 namespace {
 

@@ -10,24 +10,18 @@ of the pixels would be off by up to 0.015 px, alike where all move alike.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from functools import cache
-from importlib import import_module
 from types import ModuleType
 
 import numpy as np
 
+from sigmaslam.compiled import open_compiled, tell_slow
+
 Images = np.ndarray | Sequence[np.ndarray]
 """An image (H, W) uint8, or several of one size, of which a match may come from any."""
 
-_kernels: ModuleType | None
-try:
-    _kernels = import_module("sigmaslam.frontend._kernels")
-except ImportError:  # installed without a compiler
-    _kernels = None
-
-_LOGGER = logging.getLogger(__name__)
+_kernels = open_compiled("frontend._kernels")
 
 # Smoothing of samples, standard deviation in pixels, and the reach of its kernel in standard deviations.
 _BLUR, _REACH = 0.7, 4.0
@@ -122,7 +116,7 @@ def invert_maps(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def compiled() -> ModuleType | None:
     """The compiled functions, or None where NumPy must do, which is said once."""
     if _kernels is None:
-        _tell_slow()
+        tell_slow("patches are aligned in NumPy, which is several times slower")
     return _kernels
 
 
@@ -294,12 +288,3 @@ def _gradients(patches: np.ndarray, radius: int, spacing: float) -> tuple[np.nda
     square = patches.reshape(-1, 2 * radius + 1, 2 * radius + 1)
     along_v, along_u = np.gradient(square, np.float32(spacing), axis=(1, 2))
     return along_u.reshape(patches.shape), along_v.reshape(patches.shape)
-
-
-@cache
-def _tell_slow() -> None:
-    """Once."""
-    _LOGGER.warning(
-        "patches are aligned in NumPy, which is several times slower: install the wheel of this Python and platform, "
-        "or a C++ compiler and then sigmaslam from its sources"
-    )

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from sigmaslam.errors import FrameError
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.geometry.image_cells import pixels_in
 from sigmaslam.table import Table
@@ -180,6 +181,23 @@ class Refinement:
     moved: np.ndarray
     A: np.ndarray | None = None
     distance: np.ndarray | None = None
+
+
+def check_grey(image: np.ndarray, name: str) -> None:
+    """Refuses what is no (H, W) uint8 array, in constant time.
+
+    Raises:
+        FrameError: names the image and what was given.
+    """
+    if not isinstance(image, np.ndarray):
+        raise FrameError(
+            f"{name} is {type(image).__name__} and no array: give a grey (H, W) uint8 image, such as "
+            "cv2.imread(path, cv2.IMREAD_GRAYSCALE) returns"
+        )
+    if image.ndim != 2 or image.dtype != np.uint8:
+        mend = "; colours go by cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)" if image.ndim == 3 else ""
+        mend += "" if image.dtype == np.uint8 else "; scale the values to 0 to 255 and use image.astype(np.uint8)"
+        raise FrameError(f"{name} is {image.dtype} of shape {image.shape}: give a grey (H, W) uint8 image{mend}")
 
 
 class Frontend(Protocol):

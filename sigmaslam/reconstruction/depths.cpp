@@ -1,29 +1,12 @@
 // The compiled twins of functions of depth_fusion.py and disparity.py, which say what is computed.
 //
 // No sum is contracted or reordered (-ffp-contract=off, no -ffast-math): the bits are the same on every run.
-#include <pybind11/numpy.h>
-#include <pybind11/pybind11.h>
-#include <pybind11/stl.h>
+#include "../compiled.hpp"
 
-#include <algorithm>
-#include <array>
-#include <cmath>
-#include <cstdint>
-#include <cstring>
-#include <stdexcept>
-#include <vector>
-
-#if defined(__x86_64__)
-#include <cpuid.h>
-#endif
-
-namespace py = pybind11;
-using Reals = py::array_t<float, py::array::c_style | py::array::forcecast>;
-using Doubles = py::array_t<double, py::array::c_style | py::array::forcecast>;
-using Grey = py::array_t<uint8_t, py::array::c_style | py::array::forcecast>;
-using Rows = py::array_t<int64_t, py::array::c_style | py::array::forcecast>;
-
-#define INLINE inline __attribute__((always_inline))
+using Reals = Array<float>;
+using Doubles = Array<double>;
+using Grey = Array<uint8_t>;
+using Rows = Array<int64_t>;
 
 namespace {
 

@@ -10,17 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from types import ModuleType
 
 import cv2
 import numpy as np
 
-kernels: ModuleType | None
-try:
-    kernels = import_module("sigmaslam.reconstruction._depths")
-except ImportError:  # installed without a compiler
-    kernels = None
+from sigmaslam.compiled import open_compiled
+
+kernels = open_compiled("reconstruction._depths")
 
 # Semi-global matching: side of its blocks, what steps of disparity cost, twice OpenCV's own rule, the largest gradient
 # that counts, by how many percent the best must win, and how large what departs by more than a pixel must be to be

@@ -12,9 +12,9 @@ from sigmaslam.bounded_files import shorten
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.sample_buffer import SampleBuffer
+from sigmaslam.frontend.types import check_grey
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.backends import ONNX, backend_names
-from sigmaslam.readers.images import check_grey
 from sigmaslam.slam.config import TrackerConfig
 
 # Seconds. A clock that jumps further has another unit, or began anew; the motion in between would be unknown anyway.

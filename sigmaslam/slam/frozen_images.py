@@ -53,7 +53,7 @@ class LastPairs:
         the last.
 
         Args:
-            left, right: (H, W) uint8.
+            left, right: (H, W) uint8, as of `of_one_moment`.
         """
         pair = _Probed(left), _Probed(right)
         same, rows = [False] * len(self._pairs), pair[0].distinct | pair[1].distinct
@@ -124,19 +124,20 @@ def _shows_fields(image: np.ndarray) -> bool:
     size = image.shape[1] // 2, (len(image) - 2) // 4
     if min(size) < 1:
         return False
-    above, odd, below = (cv2.resize(image[k::4][: size[1]], size).astype(np.float32) for k in range(3))
-    between = 0.5 * (above + below)
+    above, odd, below = (cv2.resize(image[k::4][: size[1]], size) for k in range(3))
+    between = cv2.addWeighted(above, 0.5, below, 0.5, 0.0, dtype=cv2.CV_32F)
     slope = cv2.Sobel(between, cv2.CV_32F, 1, 0, ksize=1)
-    parts = [cv2.resize(each, (4, 3), interpolation=cv2.INTER_AREA) for each in (slope * (odd - between), slope**2)]
+    products = slope * cv2.subtract(odd, between, dtype=cv2.CV_32F), slope * slope
+    parts = [cv2.resize(each, (4, 3), interpolation=cv2.INTER_AREA) for each in products]
     is_aside = 4.0 * np.abs(parts[0]) > _FIELDS * parts[1]
     return bool(alternation(image) > MAX_ALTERNATION or 2 * is_aside.sum() > is_aside.size)
 
 
 class _Probed:
-    """A copy of an image (H, W) uint8, for callers may fill the same array again, and some of its rows as bytes."""
+    """An image (H, W) uint8 that nobody fills again, and some of its rows as bytes."""
 
     def __init__(self, image: np.ndarray) -> None:
-        self.pixels = image.copy()
+        self.pixels = image
         self.step = max(len(image) // _PROBES, 1)
         self.rows = [row.tobytes() for row in self.pixels[:: self.step]]
         self.distinct = frozenset(self.rows)

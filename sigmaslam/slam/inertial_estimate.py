@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.estimation.constant_velocity import MotionFilter
-from sigmaslam.estimation.inertial_motion import InertialMotion
 from sigmaslam.geometry.se3 import rotation_exp, skew
 
 
@@ -69,7 +68,7 @@ def describe_inertial(
         R_rectified_left: (3, 3) turns the left camera's axes into the rectified one's.
         T_world_camera: (4, 4) pose of the left camera.
     """
-    if not isinstance(motion, InertialMotion) or not motion.is_inertial:
+    if not motion.is_inertial:
         return None
     state = motion.state
     values, covariance = state.twist[3:12], state.covariance

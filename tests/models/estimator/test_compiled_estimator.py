@@ -8,6 +8,7 @@ import pytest
 
 import sigmaslam.estimation
 from release.view_source import write_views
+from sigmaslam.compiled import tell_slow
 from sigmaslam.estimation import estimator_graphs
 from sigmaslam.estimation.estimator_graphs import open_step
 from sigmaslam.inference.backends import load_step
@@ -92,7 +93,7 @@ def test_view_source_is_that_of_the_modules():
 
 def test_graphs_serve_without_a_compiler(monkeypatch, caplog):
     monkeypatch.setattr(estimator_graphs, "_compiled", None)
-    estimator_graphs._tell_slow.cache_clear()
+    tell_slow.cache_clear()
     with caplog.at_level(logging.WARNING):
         steps = [open_step(name) for name in ("frame_robust", "frame_gated")]
     assert steps == [load_step("frame_robust"), load_step("frame_gated")]

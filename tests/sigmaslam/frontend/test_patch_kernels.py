@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sigmaslam.compiled import tell_slow
 from sigmaslam.frontend import patch_kernels
 from sigmaslam.frontend.affine_alignment import align_patches
 from sigmaslam.frontend.followed_patches import compare_with_neighbours, correct_by_neighbours
@@ -121,7 +122,7 @@ def test_patches_find_the_shift_of_the_image(images):
 
 def test_without_a_compiler_the_twin_serves_and_says_so_once(images, monkeypatch, caplog):
     monkeypatch.setattr(patch_kernels, "_kernels", None)
-    patch_kernels._tell_slow.cache_clear()
+    tell_slow.cache_clear()
     with caplog.at_level(logging.WARNING):
         points0, points1, maps, tilt, size = mapped(20)
         found = [align_patches(*images, points0, points1, maps, tilt, *size) for _ in range(2)]

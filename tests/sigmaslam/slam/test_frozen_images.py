@@ -25,9 +25,9 @@ def test_one_repeated_image_is_enough_and_a_grey_one_says_nothing():
 def test_the_same_array_filled_again_is_another_image():
     buffer = np.random.default_rng(0).integers(0, 256, (8, 9), np.uint8)
     pair = LastPairs()
-    pair.is_repeated(buffer, buffer)
+    pair.is_repeated(*pair.of_one_moment(buffer, buffer))
     buffer ^= 1
-    assert not pair.is_repeated(buffer, buffer)
+    assert not pair.is_repeated(*pair.of_one_moment(buffer, buffer))
 
 
 def test_an_eighth_of_an_old_image_is_enough_and_white_rows_say_nothing():
