@@ -8,21 +8,16 @@ from rich.console import Console
 from rich.table import Table
 
 from sigmaslam.checks import Finding, check_sequence, has_errors
-from sigmaslam.cli.track import Imu, InputFormat, TopicLeft, TopicRight
+from sigmaslam.cli.options import Calibration, Format, Imu, Input, InputFormat, TopicLeft, TopicRight
 from sigmaslam.runs.request import InputOptions
 
 _STYLES = {"ok": "green", "unknown": "dim", "warning": "yellow", "error": "bold red"}
 
 
 def check(
-    source: Annotated[
-        Path | None,
-        typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, video or ROS bag.", show_default=False),
-    ] = None,
-    format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
-    calibration: Annotated[
-        Path | None, typer.Option(help="Calibration of any form instead of the input's own.")
-    ] = None,
+    source: Annotated[Path | None, Input] = None,
+    format: Format = InputFormat["auto"],
+    calibration: Calibration = None,
     camera: Annotated[
         str | None, typer.Option(metavar="LEFT,RIGHT", help="Live cameras in place of INPUT, as `track` takes them.")
     ] = None,
