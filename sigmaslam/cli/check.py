@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sigmaslam.checks import Finding, check_sequence, has_errors
+from sigmaslam.checks.finding import verdict
 from sigmaslam.cli.options import Calibration, Format, Imu, Input, InputFormat, TopicLeft, TopicRight
 from sigmaslam.runs.request import InputOptions
 
@@ -40,8 +41,9 @@ def check(
     sequence = options.open()
     result = check_sequence(sequence, track_imu=True)
     _print_table(result.findings)
+    typer.echo(f"Verdict: {verdict(result.findings)[1]}.")
     if out is not None:
-        from sigmaslam.checks.check_page import write_page  # loads jinja2
+        from sigmaslam.report.check_page import write_page  # loads jinja2
 
         write_page(out, result, str(sequence.source))
         typer.echo(f"Page: {out}")
