@@ -68,7 +68,9 @@ def track(
     source: Annotated[Path | None, Input] = None,
     format: Format = InputFormat["auto"],
     calibration: Calibration = None,
-    frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
+    frontend: Annotated[
+        Frontend, typer.Option(metavar="NAME", help=f"Where correspondences come from: {', '.join(FRONTENDS)}.")
+    ] = Frontend["learned"],
     backend: Annotated[
         Backend,
         typer.Option(help="What runs network and filter; torch needs 'train'."),
