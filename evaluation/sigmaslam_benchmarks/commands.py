@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from sigmaslam.cli.extras import RayAddress, need_report_extra, need_train_extra
+from sigmaslam.cli.extras import RayAddress, need_extra
 from sigmaslam.errors import InputError
 from sigmaslam.source_commit import describe_source
 
@@ -250,9 +250,8 @@ def reads_data(name: str) -> bool:
 
 def _run(name: str, out: Path, given: dict[str, Any]) -> None:
     chosen = BENCHMARKS[name]
-    for extra, need in (("train", need_train_extra), ("report", need_report_extra)):
-        if extra in chosen.extras:
-            need()
+    for extra in chosen.extras:
+        need_extra(extra)
     if _DATA in chosen.options and given["data"] is None:
         raise InputError("the folder of the real data sets is not known: give --data, or set SIGMASLAM_DATA")
     write = getattr(import_module(f"sigmaslam_benchmarks.{chosen.module}"), f"write_{name}")

@@ -70,6 +70,13 @@ def has_errors(findings: Sequence[Finding]) -> bool:
     return any(each.severity == "error" for each in findings)
 
 
+def verdict(findings: Sequence[Finding]) -> tuple[Literal["good", "warn", "bad"], str]:
+    """Kind, and in words, whether the input can be tracked."""
+    if has_errors(findings):
+        return "bad", "tracking would fail or be wrong"
+    return ("warn", "look at the warnings before tracking") if wrong(findings) else ("good", "nothing is wrong")
+
+
 def explain(findings: Sequence[Finding]) -> str:
     """Why a run on this input fails, a line for each reason: errors with the warnings that may have caused them.
 

@@ -1,4 +1,4 @@
-"""`sigmaslam calibrate`."""
+"""`sigmaslam calibrate`: cameras from images of a board; a calibration shown, converted or used."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,18 +21,38 @@ from sigmaslam.calibration.image_bootstrap import RESAMPLES, bootstrap_rigs, wid
 from sigmaslam.calibration.imu_calibration import MAX_ROUNDS, calibrate_imu
 from sigmaslam.calibration.imu_report import board_path, describe_imu_calibration, image_times, write_imu_calibration
 from sigmaslam.calibration.lens_choice import calibrate_whole_images
-from sigmaslam.cli.extras import need_report_extra
+from sigmaslam.calibration.rectified_folder import write_rectified
+from sigmaslam.calibration_files.calibration_writer import describe_calibration
+from sigmaslam.calibration_files.foreign_calibrations import FORMS, write_foreign_calibration
+from sigmaslam.cli.extras import need_extra
+from sigmaslam.cli.options import Calibration, Format, Input, InputFormat, Size, read_sized
 from sigmaslam.errors import InputError
 from sigmaslam.progress import open_progress
+from sigmaslam.readers import open_sequence
 from sigmaslam.readers.inertial import read_imu
 from sigmaslam.runs.calibrate_imu import calibrate_imu_by_run
 
 # mypy reads the members of an enum from literals alone.
 Lens = StrEnum("Lens", ["auto", *LENSES])  # type: ignore[misc]
 """Lens models."""
+Form = StrEnum("Form", list(FORMS))  # type: ignore[misc]
+"""Forms that can be written."""
+
+Source = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="Kalibr, OpenCV, ORB-SLAM, ROS, KITTI, EuRoC, ZED, OAK or 4Seasons file, our YAML, a folder with one, or "
+        "two files as left.yaml,right.yaml.",
+    ),
+]
+Rectified = Annotated[
+    bool,
+    typer.Option("--rectified", help="The images are rectified: take the cameras of P (ROS and OpenCV have both)."),
+]
 
 
-def calibrate(
+def board(
     images: Annotated[
         list[Path],
         typer.Argument(
@@ -60,7 +80,6 @@ def calibrate(
             "into OUT-camchain-imucam.yaml, by a board before the moved rig, or by a run of `track --imu off`.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the resamples of images that sigmas are compared with.")] = 0,
 ) -> None:
     """Calibrate a stereo pair, or one camera, from images of a board, with the covariance of all parameters."""
     if out.suffix.lower() not in (".yaml", ".yml"):
@@ -77,7 +96,7 @@ def calibrate(
         typer.echo(f"Written: {chain}")
         return
     if picture is not None:
-        need_report_extra()
+        need_extra("report")
     plan = parse_board(board)
     moments = find_board_images(images)
     if recording is not None:
@@ -93,7 +112,7 @@ def calibrate(
         result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
     with open_progress() as progress:
         task = progress.add_task("sigmas", total=RESAMPLES, note="")
-        result = widened(result, bootstrap_rigs(result, RESAMPLES, seed, lambda: progress.advance(task)))
+        result = widened(result, bootstrap_rigs(result, RESAMPLES, 0, lambda: progress.advance(task)))
     typer.echo(describe_board_calibration(result))
     write_board_calibration(out, result)
     if picture is not None:
@@ -106,6 +125,40 @@ def calibrate(
         typer.echo(describe_imu_calibration(found))
         write_imu_calibration(chain, result.rig.eyes, result.rig.T_left_right, found)
         typer.echo(f"Written: {chain}")
+
+
+def show(file: Source, size: Size = None, rectified: Rectified = False) -> None:
+    """Print baseline, rotation, lens models and fields of view."""
+    typer.echo(describe_calibration(read_sized(file, size, rectified)))
+
+
+def convert(
+    file: Source,
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="YAML file to write; kitti: a text file; ros and euroc: a folder.")
+    ],
+    to: Annotated[Form, typer.Option(help="Form to write; only our own keeps the covariance.")] = Form["own"],
+    size: Size = None,
+    rectified: Rectified = False,
+) -> None:
+    """Write a calibration of any form in another one, and print what is in it; what a form cannot say is refused."""
+    camera = read_sized(file, size, rectified)
+    write_foreign_calibration(out, camera, to.value)
+    typer.echo(f"{describe_calibration(camera)}\nWritten: {out}")
+
+
+def rectify(
+    source: Annotated[Path, Input],
+    out: Annotated[Path, typer.Option(help="Folder, new or empty.")],
+    format: Format = InputFormat["auto"],
+    calibration: Calibration = None,
+) -> None:
+    """Write rectified pairs without distortion: left/, right/, times.txt, calibration.yaml."""
+    sequence = open_sequence(source, format.value, calibration)
+    with open_progress() as progress:
+        task = progress.add_task("pairs", total=sequence.length, note="")
+        count = write_rectified(sequence, out, lambda done: progress.update(task, completed=done))
+    typer.echo(f"{count} rectified pairs in {out}\nTry: sigmaslam track {out} --out run")
 
 
 @contextmanager

@@ -8,21 +8,17 @@ from rich.console import Console
 from rich.table import Table
 
 from sigmaslam.checks import Finding, check_sequence, has_errors
-from sigmaslam.cli.track import Imu, InputFormat, TopicLeft, TopicRight
+from sigmaslam.checks.finding import verdict
+from sigmaslam.cli.options import Calibration, Format, Imu, Input, InputFormat, TopicLeft, TopicRight
 from sigmaslam.runs.request import InputOptions
 
 _STYLES = {"ok": "green", "unknown": "dim", "warning": "yellow", "error": "bold red"}
 
 
 def check(
-    source: Annotated[
-        Path | None,
-        typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, video or ROS bag.", show_default=False),
-    ] = None,
-    format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
-    calibration: Annotated[
-        Path | None, typer.Option(help="Calibration of any form instead of the input's own.")
-    ] = None,
+    source: Annotated[Path | None, Input] = None,
+    format: Format = InputFormat["auto"],
+    calibration: Calibration = None,
     camera: Annotated[
         str | None, typer.Option(metavar="LEFT,RIGHT", help="Live cameras in place of INPUT, as `track` takes them.")
     ] = None,
@@ -45,8 +41,9 @@ def check(
     sequence = options.open()
     result = check_sequence(sequence, track_imu=True)
     _print_table(result.findings)
+    typer.echo(f"Verdict: {verdict(result.findings)[1]}.")
     if out is not None:
-        from sigmaslam.checks.check_page import write_page  # loads jinja2
+        from sigmaslam.report.check_page import write_page  # loads jinja2
 
         write_page(out, result, str(sequence.source))
         typer.echo(f"Page: {out}")

@@ -58,19 +58,6 @@ GROUPS = {
         "render": "Render a stereo sequence with exact truth.",
     },
 }
-# Commands whose function stands elsewhere than in `sigmaslam.cli.NAME:NAME`, with their group where names are alike.
-PLACES = {
-    "demo": "track:demo",
-    "board": "calibrate:calibrate",
-    "calibrate show": "calibration:show",
-    "map show": "maps:show",
-    "merge": "maps:merge",
-    "convert": "calibration:convert",
-    "triangulate": "points:triangulate",
-    "orient": "points:orient",
-    "network": "train:train",
-    "scorer": "train:train_scorer",
-}
 # What a group does whose first word is none of its commands.
 DEFAULTS = {"calibrate": "board", "train": "network"}
 # Names of the release before.
@@ -87,7 +74,7 @@ RENAMED = {
 
 
 class _Commands(UserDict[str, Any]):
-    """Commands of a group by name; the module of one of `GROUPS` is imported when the command is asked for."""
+    """Commands of a group by name; the group's module, or the command's own, is imported when one is asked for."""
 
     group = ""
 
@@ -97,11 +84,10 @@ class _Commands(UserDict[str, Any]):
             return found
         if name in GROUPS:
             return CommandGroup(name=name, help=found, no_args_is_help=True, rich_markup_mode=None)
-        place = PLACES.get(f"{self.group} {name}") or PLACES.get(name, f"{name}:{name}")
-        module, function = place.split(":")
+        module = "track" if name == "demo" else name if self.group == "sigmaslam" else self.group
         # Plain help: rich's tables cut long words and give flags a type.
         alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-        function = getattr(import_module(f"sigmaslam.cli.{module}"), function)
+        function = getattr(import_module(f"sigmaslam.cli.{module}"), name)
         alone.command(name, cls=PanelCommand, short_help=found)(function)
         return typer.main.get_command(alone)
 

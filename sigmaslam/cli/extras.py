@@ -1,11 +1,11 @@
 """Optional parts of the package: what a command says when one is not installed, and the option of Ray."""
 
+from importlib import import_module
 from typing import Annotated
 
 import typer
 
 from sigmaslam.errors import InputError
-from sigmaslam.plot_style import NO_MATPLOTLIB, has_matplotlib
 
 RayAddress = Annotated[
     str | None,
@@ -18,33 +18,19 @@ RayAddress = Annotated[
     ),
 ]
 
-
-def need_train_extra() -> None:
-    """Refuses a command of the extra `train` where torch or kornia is missing."""
-    need_torch()
-    try:
-        import kornia  # noqa: F401
-    except ImportError as error:
-        raise InputError(f"{error.name} is not installed: pip install 'sigmaslam[train]'") from error
+# By extra: what its commands cannot do without, and where it comes from.
+_EXTRAS = {
+    "train": (("torch", "kornia"), "pip install 'sigmaslam[train]'"),
+    "viewer": (("rerun",), "pip install 'sigmaslam[viewer]'"),
+    "report": (("matplotlib",), "pip install 'sigmaslam[report]'"),
+}
 
 
-def need_torch() -> None:
-    """Refuses a command of the filters where torch is missing; nothing else of the extra `train` is needed."""
-    try:
-        import torch  # noqa: F401
-    except ImportError as error:
-        raise InputError("torch is not installed: pip install torch, or 'sigmaslam[train]'") from error
-
-
-def need_viewer_extra() -> None:
-    """Refuses a viewer where rerun is missing."""
-    try:
-        import rerun  # noqa: F401
-    except ImportError as error:
-        raise InputError("rerun is not installed: pip install 'sigmaslam[viewer]'") from error
-
-
-def need_report_extra() -> None:
-    """Refuses a command that only draws where matplotlib is missing."""
-    if not has_matplotlib():
-        raise InputError(NO_MATPLOTLIB)
+def need_extra(extra: str, *packages: str) -> None:
+    """Refuses a command where an extra is not installed; where packages are given, it needs these of it alone."""
+    all_packages, mend = _EXTRAS[extra]
+    for name in packages or all_packages:
+        try:
+            import_module(name)
+        except ImportError as error:
+            raise InputError(f"{error.name} is not installed: {mend}") from error

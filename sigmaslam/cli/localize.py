@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sigmaslam.cli.extras import need_torch
+from sigmaslam.cli.extras import need_extra
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, check_new_folder, csv_text, make_folder
 
@@ -59,7 +59,7 @@ def localize(
     nothing but the sightings themselves says which landmark they are of. With --compare there is such a folder for each
     filter, and comparison.csv with errors, consistency and time of all.
     """
-    need_torch()
+    need_extra("train", "torch")
     from sigmaslam_filters import FilterError
     from sigmaslam_localisation.formats import detect_format
 

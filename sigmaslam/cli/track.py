@@ -15,7 +15,8 @@ import typer
 
 from sigmaslam.checks.check import SAMPLES_BEFORE_TRACKING, check_sequence
 from sigmaslam.checks.finding import Finding, wrong
-from sigmaslam.cli.extras import need_train_extra
+from sigmaslam.cli.extras import need_extra
+from sigmaslam.cli.options import Calibration, Format, Imu, Input, InputFormat, Provider, TopicLeft, TopicRight, Weights
 from sigmaslam.cli.panels import HelpAll
 from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.cli.track_sinks import open_sinks
@@ -24,10 +25,9 @@ from sigmaslam.files import check_new_folder, printable
 from sigmaslam.frontend import FRONTENDS
 from sigmaslam.frontend.build import own_networks
 from sigmaslam.inference.backends import backend_names
-from sigmaslam.inference.session import PROVIDERS, check_provider
+from sigmaslam.inference.session import check_provider
 from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence
-from sigmaslam.readers.open import FORMATS
 from sigmaslam.run_record.removal import remove_run
 from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
 
@@ -43,35 +43,6 @@ Frontend = StrEnum("Frontend", FRONTENDS)  # type: ignore[misc]
 """Where correspondences come from."""
 Backend = StrEnum("Backend", backend_names())  # type: ignore[misc]
 """What runs the network and the filter."""
-Provider = StrEnum("Provider", list(PROVIDERS))  # type: ignore[misc]
-"""Where ONNX Runtime computes the networks."""
-InputFormat = StrEnum("InputFormat", FORMATS)  # type: ignore[misc]
-"""Kinds of input."""
-
-# Options that `check` has as well.
-TopicLeft = Annotated[
-    str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'left', cam0 or infra1")
-]
-TopicRight = Annotated[
-    str | None, typer.Option(help="Image topic in a bag.", show_default="the one with 'right', cam1 or infra2")
-]
-Imu = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE|TOPIC|off",
-        help="Inertial sensor: CSV (time, rad/s, m/s^2) with its YAML beside, KITTI's oxts, or a bag's topic; off: "
-        "use none.",
-        show_default="the one in INPUT, if files say all of it",
-    ),
-]
-Weights = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FOLDER",
-        help="Your own networks, as `sigmaslam train export` writes them; of those that it lacks, the ones that ship.",
-        show_default="what ships",
-    ),
-]
 
 
 def demo(
@@ -94,16 +65,12 @@ def demo(
 
 def track(
     out: Annotated[Path, typer.Option(help="Run folder, new or empty.")],
-    source: Annotated[
-        Path | None,
-        typer.Argument(metavar="INPUT", help="KITTI, EuRoC or plain folder, video or ROS bag.", show_default=False),
-    ] = None,
-    format: Annotated[InputFormat, typer.Option(help="Kind of input.")] = InputFormat["auto"],
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="Calibration of any form, or two as left.yaml,right.yaml, instead of the input's own."),
-    ] = None,
-    frontend: Annotated[Frontend, typer.Option(help="Where correspondences come from.")] = Frontend["learned"],
+    source: Annotated[Path | None, Input] = None,
+    format: Format = InputFormat["auto"],
+    calibration: Calibration = None,
+    frontend: Annotated[
+        Frontend, typer.Option(metavar="NAME", help=f"Where correspondences come from: {', '.join(FRONTENDS)}.")
+    ] = Frontend["learned"],
     backend: Annotated[
         Backend,
         typer.Option(help="What runs network and filter; torch needs 'train'."),
@@ -242,7 +209,7 @@ def track(
     """
     request = _read_request(locals())
     if request.tracker.backend == "torch":
-        need_train_extra()
+        need_extra("train")
     check_provider(request.tracker.provider, request.tracker.backend)
     own_networks(request.tracker.frontend, weights, request.tracker.backend)
     sequence = request.input.open()

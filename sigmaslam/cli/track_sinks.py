@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from sigmaslam.cli.extras import need_viewer_extra
+from sigmaslam.cli.extras import need_extra
 from sigmaslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
     name, colon, file = viewer.partition(":")
     if name != "rerun" or (colon and not file):
         raise InputError(f"--viewer {viewer}: is no viewer; give rerun for a window, or rerun:FILE.rrd")
-    need_viewer_extra()
+    need_extra("viewer")
     from sigmaslam.live.rerun_viewer import RerunSink
 
     path = Path(file) if file else None

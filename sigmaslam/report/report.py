@@ -3,15 +3,14 @@
 import base64
 import json
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from sigmaslam.files import atomic_write_text, printable
+from sigmaslam.report.page_parts import load_template, read_asset
 from sigmaslam.report.report_facts import (
     judge,
     list_calibration,
@@ -132,23 +131,15 @@ def write_page(
         page: what else the scripts need.
         **words: what else the template needs.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sigmaslam.report", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    assets = files("sigmaslam.report") / "assets"
     most = MAX_FRAMES // len(seconds)
     for series in (each for plot in plots for each in plot["series"]):
         series["values"] = thin(series["values"], most)
     page = {"seconds": [thin(each, most) for each in seconds], "plots": plots, "scenes": scenes, **page}
-    text = environment.get_template(template).render(
+    text = load_template(template).render(
         scenes=scenes,
         plots=plots,
-        styles=Markup("\n".join((assets / name).read_text(encoding="utf-8") for name in _STYLES)),
-        scripts=[Markup((assets / name).read_text(encoding="utf-8")) for name in _SCRIPTS],
+        styles=Markup("\n").join(read_asset(name) for name in _STYLES),
+        scripts=[read_asset(name) for name in _SCRIPTS],
         # A "<" could end the script element in which the text stands.
         page=Markup(json.dumps(page, separators=(",", ":"), allow_nan=False, default=_pack).replace("<", "\\u003c")),
         **words,

@@ -75,6 +75,9 @@ def list_facts(run: RecordedRun) -> Facts:
     position, rotation = run.sigmas
     if len(position) and np.isfinite(position[-1]):
         facts.append(("sigma at the end", f"{_length(position[-1])}, {np.degrees(rotation[-1]):.2g}°"))
+    drift, turn = (_median(each) for each in run.sigmas_over_a_second)
+    if drift is not None and turn is not None:
+        facts.append(("sigma over a second", f"{_length(drift)}, {np.degrees(turn):.2g}°"))
     facts += _errors(run)
     keyframes, inliers = frames.columns["keyframe"], frames.columns["inliers"]
     if np.isfinite(keyframes).any():

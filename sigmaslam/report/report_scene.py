@@ -146,8 +146,10 @@ def _magnification(run: RecordedRun, size: float) -> int:
 def _labels(run: RecordedRun, seconds: np.ndarray, shown: np.ndarray) -> list[str]:
     """What is said of each pose where the mouse is on it."""
     position, rotation = run.sigmas
+    drift, turn = run.sigmas_over_a_second
     status = run.pose_status
     return [
         f"{seconds[k]:.2f} s, {status[k]}\nsigma {1e3 * position[k]:.3g} mm, {np.degrees(rotation[k]):.3g} deg"
+        + (f"; over a second {1e3 * drift[k]:.3g} mm, {np.degrees(turn[k]):.3g} deg" if np.isfinite(drift[k]) else "")
         for k in shown
     ]

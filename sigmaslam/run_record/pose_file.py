@@ -1,15 +1,27 @@
-"""poses.partial of a run: what was said of each frame with a pose, on disk as it came; gone when the run is written."""
+"""What was said of each frame with a pose: poses.partial as it comes, poses.csv in the end."""
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.files import atomic_write_bytes
+from sigmaslam.files import atomic_path, atomic_write_bytes
+from sigmaslam.geometry.se3 import matrix_to_quaternion
 from sigmaslam.run_record.appended_file import AppendedFile, pack_rows, read_rows
+from sigmaslam.run_record.frame_table import FrameTable
 from sigmaslam.table import Table
 
 PARTIAL_POSES = "poses.partial"
+POSES_NAME = "poses.csv"
+_ERRORS = ("x", "y", "z", "rx", "ry", "rz")
+_UPPER = np.triu_indices(6)
+COLUMNS = (
+    *("timestamp", "status", "x", "y", "z", "qx", "qy", "qz", "qw"),
+    *(f"cov_{_ERRORS[row]}_{_ERRORS[column]}" for row, column in zip(*_UPPER, strict=True)),
+)
+"""Seconds, status, position in metres, rotation, and the upper triangle of the covariance (6, 6) of the pose in its own
+frame, translation in metres before rotation in radians."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,3 +60,24 @@ def read_pose_records(folder: Path) -> PoseRecords:
 def write_pose_records(folder: Path, records: PoseRecords) -> None:
     """Writes poses as a run leaves them, so that it can go on."""
     atomic_write_bytes(folder / PARTIAL_POSES, pack_rows(*records.columns()))
+
+
+def write_pose_table(path: Path, records: PoseRecords, frames: FrameTable) -> None:
+    """Writes poses as they were said, with the status of their frames.
+
+    Args:
+        path: of the table.
+        records: the poses.
+        frames: of the run, in order of time.
+    """
+    # frames.csv has nanoseconds.
+    rows = np.searchsorted(frames.columns["timestamp"], records.timestamp - 5e-7)
+    quaternions = matrix_to_quaternion(records.pose[:, :3, :3])
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for k, row in enumerate(rows):
+            numbers = (*records.pose[k, :3, 3], *quaternions[k], *records.covariance[k][_UPPER])
+            table.writerow(
+                [f"{records.timestamp[k]:.9f}", frames.status[row], *(f"{number:.9g}" for number in numbers)]
+            )

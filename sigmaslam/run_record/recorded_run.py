@@ -21,6 +21,7 @@ from sigmaslam.run_record.evaluated_frames import (
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME, FramePictures, read_pictures
 from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, read_frames
 from sigmaslam.run_record.inertial_file import InertialRecords, read_inertial_records
+from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
 from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, RUN_NAME
 
 REFINED_TRAJECTORY, REFINE_NAME = "trajectory_refined.tum", "refine.json"
@@ -60,6 +61,7 @@ class RecordedRun:
         evaluation, refinement: content of evaluation.json and refine.json.
         evaluated: errors of frames.
         inertial: the state of an inertial sensor, where gravity was known.
+        pairs: poses relative to earlier keyframes.
     """
 
     folder: Path
@@ -77,6 +79,7 @@ class RecordedRun:
     refinement: dict[str, Any]
     evaluated: EvaluatedFrames | None
     inertial: InertialRecords | None
+    pairs: FramePairs | None
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -92,9 +95,16 @@ class RecordedRun:
     @property
     def sigmas(self) -> tuple[np.ndarray, np.ndarray]:
         """(N,), (N,) standard deviation of the position (metres) and of the rotation (radians), each as a whole."""
-        variances = np.diagonal(self.covariances, axis1=1, axis2=2)
-        position, rotation = (np.sqrt(variances[:, part].sum(axis=1)) for part in (slice(0, 3), slice(3, 6)))
-        return position, rotation
+        return _whole_sigmas(self.covariances)
+
+    @property
+    def sigmas_over_a_second(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N,), (N,) the same of poses relative to a keyframe about a second before; NaN where there is none."""
+        covariances = np.full_like(self.covariances, np.nan)
+        if self.pairs is not None:
+            chosen = self.pairs.span == "1 s"
+            covariances[self.pairs.later[chosen]] = self.pairs.covariance[chosen]
+        return _whole_sigmas(covariances)
 
     def of_frames(self, values: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Numbers of poses (all, or those of the given rows) as numbers of all frames (F,); NaN for the others."""
@@ -116,6 +126,7 @@ def read_run(folder: Path) -> RecordedRun:
     if len(pose_row) and pose_row.max() >= len(frames):
         raise InputError(f"{folder / FRAMES_NAME}: ends before trajectory.tum: both must come from the same run")
     path, count, errors = folder / "covariance.npy", len(trajectory), folder / EVALUATED_FRAMES_NAME
+    relative = folder / RELATIVE_POSES_NAME
     return RecordedRun(
         folder=folder,
         frames=frames,
@@ -132,6 +143,7 @@ def read_run(folder: Path) -> RecordedRun:
         refinement=_read_json(folder / REFINE_NAME, "refine"),
         evaluated=read_evaluated_frames(errors, count) if errors.is_file() else None,
         inertial=read_inertial_records(folder),
+        pairs=read_frame_pairs(relative, count) if relative.is_file() else None,
     )
 
 
@@ -149,6 +161,12 @@ def read_final_trajectory(folder: Path) -> tuple[Trajectory, Trajectory]:
             "from the same run"
         )
     return said, final
+
+
+def _whole_sigmas(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Roots of the traces of both diagonal blocks (N, 3, 3) of covariances (N, 6, 6)."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    return np.sqrt(variances[:, :3].sum(axis=1)), np.sqrt(variances[:, 3:].sum(axis=1))
 
 
 def _read_trajectory(path: Path) -> Trajectory | None:

@@ -10,8 +10,7 @@ from sigmaslam.run_record.evaluated_frames import EVALUATED_FRAMES_NAME, EVALUAT
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
 from sigmaslam.run_record.frame_table import FRAMES_NAME
 from sigmaslam.run_record.inertial_file import INERTIAL_NAME
-from sigmaslam.run_record.pose_file import PARTIAL_POSES
-from sigmaslam.run_record.pose_table import POSES_NAME
+from sigmaslam.run_record.pose_file import PARTIAL_POSES, POSES_NAME
 from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY
 from sigmaslam.run_record.relative_pose_file import PARTIAL_RELATIVE_POSES, RELATIVE_POSES_NAME
 from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RERUN_NAME, RUN_NAME, VIDEO_NAME

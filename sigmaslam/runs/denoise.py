@@ -1,8 +1,7 @@
-"""Filtering images from disk: one by one, as a sequence, or both eyes of a stereo sequence."""
+"""Filtering images from disk, one by one or as a sequence, and both eyes of a run."""
 
 import time
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder, make_folder
+from sigmaslam.files import atomic_path, check_new_folder, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.progress import open_progress
-from sigmaslam.readers import StereoFrame, StereoSequence
+from sigmaslam.readers import StereoFrame
 from sigmaslam.readers.images import IMAGE_SUFFIXES, read_grey
 from sigmaslam.readers.pairing import list_images
 from sigmaslam.readers.video import read_frames
@@ -29,29 +27,24 @@ class DenoiseSummary:
 
     Attributes:
         images: how many were written.
-        noise: of the first image, or the first of each eye.
+        noise: of the first image.
         seconds: in the filters, reading and writing left out.
     """
 
     images: int
-    noise: tuple[NoiseModel, ...]
+    noise: NoiseModel
     seconds: float
 
     def describe(self) -> str:
-        """Two lines, or one for each eye and one."""
-        lines = [_describe_noise(noise) for noise in self.noise]
-        return "\n".join([*lines, f"{self.images} images in {self.seconds:.1f} s"])
+        """Two lines."""
+        return f"{_describe_noise(self.noise)}\n{self.images} images in {self.seconds:.1f} s"
 
 
 class StereoFilter:
-    """A filter for each eye.
+    """A filter for each eye, which estimates the noise from its first image."""
 
-    Args:
-        noise: of the images of both; None to estimate that of each from its first image.
-    """
-
-    def __init__(self, noise: NoiseModel | None = None) -> None:
-        self._eyes = SequenceFilter(noise), SequenceFilter(noise)
+    def __init__(self) -> None:
+        self._eyes = SequenceFilter(), SequenceFilter()
 
     def step(self, frame: StereoFrame) -> StereoFrame:
         """The frame with its images filtered.
@@ -65,14 +58,9 @@ class StereoFilter:
         )
         return replace(frame, left=left, right=right)
 
-    @property
-    def noise(self) -> tuple[NoiseModel, ...]:
-        """Of the left and right eye; empty before the first frame."""
-        return tuple(eye.noise for eye in self._eyes if eye.noise is not None)
-
     def describe(self) -> list[dict[str, Any]]:
-        """Entries of run.json."""
-        return [asdict(noise) for noise in self.noise]
+        """Entries of run.json: the noise of the left and right eye; none before the first frame."""
+        return [asdict(eye.noise) for eye in self._eyes if eye.noise is not None]
 
 
 def denoise_files(
@@ -122,40 +110,7 @@ def denoise_files(
             progress.update(task, completed=count)
     if used is None:
         raise InputError(f"{source}: no image; give an image, a folder that holds some, or a video")
-    return DenoiseSummary(count, (used,), seconds)
-
-
-def denoise_stereo(sequence: StereoSequence, out: Path, noise: NoiseModel | None = None) -> DenoiseSummary:
-    """Filters both eyes of a stereo sequence; writes a folder that `sigmaslam track` reads.
-
-    Args:
-        sequence: opened by `sigmaslam.readers.open_sequence`.
-        out: new or empty folder, for left/ and right/, times.txt and calibration.yaml.
-        noise: None to estimate that of each eye from its first image.
-    Raises:
-        InputError: the sequence breaks off; what was filtered is on disk then.
-    """
-    check_new_folder(out)
-    for eye in ("left", "right"):
-        make_folder(out / eye)
-    write_calibration(out / "calibration.yaml", sequence.camera)
-    both = StereoFilter(noise)
-    times: list[float] = []
-    seconds = 0.0
-    try:
-        with open_progress() as progress, closing(sequence.frames()) as frames:
-            task = progress.add_task("pairs", total=sequence.length, note="")
-            for frame in frames:
-                began = time.perf_counter()
-                result = both.step(frame)
-                seconds += time.perf_counter() - began
-                for eye, image in (("left", result.left), ("right", result.right)):
-                    _write(out / eye / f"{len(times):06d}.png", image)
-                times.append(frame.timestamp)
-                progress.update(task, completed=len(times))
-    finally:
-        atomic_write_text(out / "times.txt", "".join(f"{each:.9f}\n" for each in times))
-    return DenoiseSummary(2 * len(times), both.noise, seconds)
+    return DenoiseSummary(count, used, seconds)
 
 
 def _read(source: Path) -> Iterator[tuple[str, np.ndarray]]:

@@ -18,17 +18,15 @@ from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
 from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, TRACKED, FrameTable, predicted_poses, read_frames
 from sigmaslam.run_record.inertial_file import describe_gravity, read_inertial_records
-from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records
-from sigmaslam.run_record.pose_table import POSES_NAME, write_pose_table
+from sigmaslam.run_record.pose_file import PARTIAL_POSES, POSES_NAME, PoseRecords, read_pose_records, write_pose_table
 from sigmaslam.run_record.relative_pose_file import (
     PARTIAL_RELATIVE_POSES,
     RELATIVE_POSES_NAME,
     collect_frame_pairs,
     write_frame_pairs,
 )
-from sigmaslam.run_record.run_failure import explain_failure
 from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_map_points
-from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
+from sigmaslam.run_record.verdict import calibration_verdict, expected_offset, explain_failure
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
 

@@ -66,11 +66,11 @@ class MapFile:
     def describe(self) -> str:
         """What it holds, a line each."""
         places = np.array([self.pose(each)[:3, 3] for each in self.known])
-        extent = " x ".join(f"{side:.1f}" for side in np.ptp(places, axis=0))
+        extent = " x ".join(f"{side:.2f}" for side in np.ptp(places, axis=0))
         camera = self.camera
         return (
             f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB\n"
-            f"keyframes  {len(self.known)}, {len(self.hanging)} of them at neighbours; within {extent} m\n"
+            f"keyframes  {len(self.known)} within {extent} m; {len(self.hanging)} of them placed by a neighbour\n"
             f"points     {len(self.points.points)}\n"
             f"front-end  {self.frontend}\n"
             f"camera     {camera.width}x{camera.height}, f {camera.fx:.1f} px, baseline {camera.baseline:.4f} m"

@@ -29,7 +29,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         return "the page"
 
     monkeypatch.setattr(commands, "import_module", lambda name: SimpleNamespace(write_features=write_features))
-    monkeypatch.setattr(commands, "need_train_extra", lambda: None)
+    monkeypatch.setattr(commands, "need_extra", lambda name: None)
     monkeypatch.delenv("SIGMASLAM_DATA", raising=False)
     return taken
 

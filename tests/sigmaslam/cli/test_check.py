@@ -50,6 +50,8 @@ def test_check_ends_with_code_1_where_the_eyes_are_exchanged(swapped: Path, tmp_
     assert "swap the two" in " ".join(re.sub("[│┃]", " ", result.stdout).split())
     page = (tmp_path / "page.html").read_text()
     assert "swap the two" in page
+    assert page.index("tracking would fail or be wrong") < page.index("swap the two") < page.index("<table>")
+    assert "Verdict: tracking would fail or be wrong." in result.stdout
     assert "<i>" not in page
 
 

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.readers import open_sequence
 from tests.support.commands import assert_refused, run_here
 from tests.support.tracked import track
 
@@ -58,16 +57,6 @@ def test_a_video_becomes_images(tmp_path: Path):
     assert means == pytest.approx([50.0, 100.0, 150.0], abs=2.0)
 
 
-def test_a_stereo_sequence_becomes_one_that_can_be_tracked(noisy_pairs: Path, tmp_path: Path):
-    done = run_here("images", "denoise", noisy_pairs, "--stereo", "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    before, after = open_sequence(noisy_pairs), open_sequence(tmp_path / "out")
-    assert after.timestamps == pytest.approx(before.timestamps)
-    assert after.camera.baseline == pytest.approx(before.camera.baseline)
-    for eye, original in (("left", "image_0"), ("right", "image_1")):
-        assert rmse(tmp_path / "out" / eye / "000002.png", DEMO / original / "000002.png") < 0.5 * SIGMA
-
-
 @pytest.mark.long
 def test_the_tracker_sees_filtered_images_and_the_run_says_so(noisy_pairs: Path, tmp_path: Path):
     track(noisy_pairs, tmp_path / "run", "orb", threads=1, denoise=True)
@@ -91,7 +80,3 @@ def test_what_cannot_be_filtered_is_refused(noisy_pairs: Path, tmp_path: Path):
         found = run_here("images", "denoise", images, option, "inf", "--out", tmp_path / "g")
         assert found.returncode == 2
         assert f"Invalid value for '{option}'" in found.stderr
-    assert_refused(
-        run_here("images", "denoise", noisy_pairs, "--stereo", "--single", "--out", tmp_path / "e"), "--single"
-    )
-    assert_refused(run_here("images", "denoise", images, "--format", "kitti", "--out", tmp_path / "f"), "--stereo")

@@ -17,7 +17,7 @@ from sigmaslam.geometry.se3 import quaternion_to_matrix, se3_exp
 from sigmaslam.live.estimate_stream import PipeStream, format_estimate, open_stream
 from sigmaslam.live.frame_sink import TrackedFrame
 from sigmaslam.readers import open_sequence
-from sigmaslam.run_record.pose_table import COLUMNS
+from sigmaslam.run_record.pose_file import COLUMNS
 from sigmaslam.runs.request import LiveOptions
 from tests.support.commands import command_line, environment, run_process
 from tests.support.demo_parts import copy_frames

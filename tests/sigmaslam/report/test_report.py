@@ -10,6 +10,7 @@ from sigmaslam.report.report import write_report
 from sigmaslam.run_record.evaluated_frames import EvaluatedFrames, write_evaluation
 from sigmaslam.run_record.frame_table import STATUSES, read_frames
 from sigmaslam.run_record.recorded_run import read_run
+from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, write_frame_pairs
 from tests.support.pages import Page, unpack
 from tests.support.recorded_runs import HEADER, STAGES, make_run
 
@@ -155,6 +156,20 @@ def test_sigmas_are_those_of_the_covariance(tmp_path):
         drawn = page.values(title, "3 sigma")
         assert np.flatnonzero(np.isnan(drawn)).tolist() == [50]
         np.testing.assert_allclose(np.delete(drawn, 50), 3 * unit * np.sqrt(variances[:, part].sum(axis=1)), rtol=1e-5)
+
+
+def test_labels_and_head_say_how_well_the_last_second_is_known(tmp_path):
+    make_run(tmp_path / "run")
+    covariance = np.diag([9e-6, 16e-6, 0.0, 0.0, 0.0, np.radians(0.1) ** 2])
+    pairs = FramePairs(
+        np.array(["1 s", "1 m"]), np.zeros(2, int), np.full(2, 30), np.stack([np.eye(4)] * 2), [covariance] * 2
+    )
+    write_frame_pairs(tmp_path / "run" / RELATIVE_POSES_NAME, pairs)
+    page = _page(tmp_path / "run")
+    labels = page.data["scenes"][0]["labels"]
+    assert labels[30].endswith("; over a second 5 mm, 0.1 deg")
+    assert "over a second" not in labels[31]
+    assert "sigma over a second 5 mm, 0.1°" in page.words
 
 
 def test_an_evaluation_is_in_the_report(tmp_path):

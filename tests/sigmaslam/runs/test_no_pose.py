@@ -18,7 +18,7 @@ from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, read_tum, write_kitti
 from sigmaslam.run_record.frame_table import STATUSES, TRACKED, predicted_poses, read_frames
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
-from sigmaslam.run_record.run_failure import explain_failure
+from sigmaslam.run_record.verdict import explain_failure
 from sigmaslam_benchmarks.trial import read_trial
 from sigmaslam_evaluation.evaluation_figure import plot_trajectory
 from sigmaslam_evaluation.evaluation_summary import format_evaluation

@@ -27,7 +27,7 @@ def test_two_maps_become_one(demo_sequence: Path, tmp_path: Path, without_report
     said = run_here("map", "merge", str(tmp_path / "one"), str(other.path), "--out", str(tmp_path / "merged.npz"))
     assert said.returncode == 0, said.stderr
     assert said.stdout == run_here("map", "show", str(tmp_path / "merged.npz")).stdout
-    assert f"keyframes  {len(one.known) + len(other.known)}, " in said.stdout
+    assert f"keyframes  {len(one.known) + len(other.known)} within " in said.stdout
     merged = MapFile(tmp_path / "merged.npz")
     assert len(merged.known) == len(one.known) + len(other.known)
     assert len(merged.points.points) == len(one.points.points) + len(other.points.points)

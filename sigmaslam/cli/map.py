@@ -1,9 +1,13 @@
-"""`sigmaslam map reconstruct`."""
+"""`sigmaslam map`: what can be made of a run."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+
+_FILE = "map.npz of a run of `sigmaslam track`, or its folder"
 
 
 def reconstruct(
@@ -62,3 +66,43 @@ def reconstruct(
     if export is not None:
         typer.echo(f"Images and poses: {export}")
     typer.echo(f"Report: {run / 'report.html'}")
+
+
+def refine(
+    run: Annotated[Path, typer.Argument(help="Run folder that 'track --tracks' wrote.")],
+    out: Annotated[Path, typer.Option(help="Folder, new or empty.")],
+) -> None:
+    """Adjust all keyframes, landmarks and the disparity offset of a run at once (needs the extra 'graph').
+
+    The offline reference for the filter. Writes trajectory, covariance, map and refine.json; prints the latter.
+    """
+    from sigmaslam.bundle_adjustment import refine_run
+
+    with Console(stderr=True).status("reading") as status:
+        summary = refine_run(run, out, tell=status.update)
+    typer.echo(json.dumps(summary, indent=2))
+
+
+def show(maps: Annotated[list[Path], typer.Argument(metavar="MAP", help=f"{_FILE}; any number.")]) -> None:
+    """Print what maps hold: keyframes, points, extent, front-end, camera."""
+    from sigmaslam.slam.map_merging import MapFile
+
+    typer.echo("\n\n".join(MapFile(path).describe() for path in maps))
+
+
+def merge(
+    one: Annotated[Path, typer.Argument(metavar="MAP", help=f"{_FILE}: the one whose world is kept.")],
+    other: Annotated[Path, typer.Argument(metavar="OTHER", help="Map of the same camera that overlaps with it.")],
+    out: Annotated[Path, typer.Option(help="Map file, for `sigmaslam track --map`.")],
+) -> None:
+    """Make one map of two runs in one place.
+
+    Keyframes of the second map are found in the first; two must lie to each other as their own map says. All of them
+    hang at one keyframe of the first from then on, with its certainty.
+    """
+    from sigmaslam.files import save_arrays
+    from sigmaslam.slam.map_merging import MapFile
+    from sigmaslam.slam.map_merging import merge as merge_files
+
+    save_arrays(out, **merge_files(MapFile(one), MapFile(other)))
+    typer.echo(MapFile(out).describe())

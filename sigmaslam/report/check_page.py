@@ -4,13 +4,14 @@ import base64
 from pathlib import Path
 
 import cv2
-import jinja2
 import numpy as np
 
 from sigmaslam.checks.check import Check
 from sigmaslam.checks.eye_matches import draw_rows
+from sigmaslam.checks.finding import verdict, wrong
 from sigmaslam.files import atomic_write_text
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
+from sigmaslam.report.page_parts import load_template, read_asset
 
 # Thumbnails, pixels, and how many.
 _WIDTH, _MOST = 640, 4
@@ -24,11 +25,13 @@ def write_page(path: Path, check: Check, source: str) -> None:
     Raises:
         InputError: the folder is missing or cannot be written.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sigmaslam.checks", "templates"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    text = environment.get_template("check.html").render(
+    kind, word = verdict(check.findings)
+    text = load_template("check.html").render(
+        styles=read_asset("report.css"),
         source=source,
+        kind=kind,
+        word=word,
+        faults=wrong(check.findings),
         findings=check.findings,
         pictures=[(f"pair {index}", _picture(check, k)) for k, index in _shown(check)],
         tolerance=ROW_TOLERANCE,

@@ -1,0 +1,22 @@
+"""What pages are made of: templates, styles and scripts of the package."""
+
+from importlib.resources import files
+
+import jinja2
+from markupsafe import Markup
+
+
+def load_template(name: str) -> jinja2.Template:
+    """A template of the folder; it escapes what it is given."""
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("sigmaslam.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    ).get_template(name)
+
+
+def read_asset(name: str) -> Markup:
+    """A style or a script, which a page holds as it is."""
+    return Markup((files("sigmaslam.report") / "assets" / name).read_text(encoding="utf-8"))
