@@ -78,12 +78,16 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
         matches = matches.select(followed)
     x, y = ((matches.right - 0.5 * np.array([camera.width - 1, camera.height - 1])) / [camera.fx, camera.fy]).T
     flow = matches.flow if moving else np.zeros_like(matches.flow)
+    rows, chances = matches.row_difference, matches.probability
     columns = np.column_stack([np.ones(len(matches)), x, y, x * y, flow[:, 1]])
-    estimated = np.array([True, True, True, True, moving])
-    coefficients, sigmas = np.zeros(5), np.full(5, np.nan)
-    coefficients[estimated], sigmas[estimated] = _fit(
-        columns[:, estimated], matches.row_difference, matches.probability
-    )
+    coefficients, sigmas, count = np.zeros(5), np.full(5, np.nan), 4 + moving
+    coefficients[:count], sigmas[:count] = _fit(columns[:, :count], rows, chances)
+    if moving:
+        # A bump between two pairs lowers all rows of the later ones, which is no delay: let each have its own shift.
+        own = _fit(np.column_stack([columns, matches.pair[:, None] == np.unique(matches.pair)[1:]]), rows, chances)
+        if abs(own[0][4] - coefficients[4]) > SIGNIFICANT * np.hypot(own[1][4], sigmas[4]):
+            coefficients[4], sigmas[4] = own[0][4], own[1][4]
+            coefficients[:4], sigmas[:4] = _fit(columns[:, :4], rows - coefficients[4] * flow[:, 1], chances)
     shift, roll, zoom, yaw, lag = coefficients.tolist()
     return RowFit(
         matches,
@@ -96,7 +100,7 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
         columns[:, [1, 3]] @ coefficients[[1, 3]],
         columns[:, 2] * zoom,
         lag * flow,
-        matches.row_difference - columns @ coefficients,
+        rows - columns @ coefficients,
     )
 
 

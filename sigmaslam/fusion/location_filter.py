@@ -27,7 +27,6 @@ from sigmaslam.fusion.sensor_model import (
     STATE_SIZE,
     FusionState,
     PosedReadings,
-    SensorModel,
     find_worlds,
     reading_jacobian,
     residuals,
@@ -259,9 +258,8 @@ class LocationFilter:
         share = tracked.share
         frame_covariance = (share**2 + (1.0 - share) ** 2) * tracked.frame_covariance
         self._unsolved.append((row, tracked.pose, self._belief.drift_covariance, frame_covariance))
-        state = find_worlds(
-            self._posed_readings(), self._belief.drift_covariance, self._on_object, self._solved_model()
-        )
+        model = None if self._belief.state is None else self._belief.state.model
+        state = find_worlds(self._posed_readings(), self._belief.drift_covariance, self._on_object, model)
         self._belief = _Belief(state, self._belief.drift_covariance)
         self._renew_frame_error(tracked.frame_covariance)
         full = len(self._unsolved) >= _MAX_READINGS
@@ -271,9 +269,6 @@ class LocationFilter:
                 self._unsolved.clear()
         elif full:
             self._unsolved = self._unsolved[::2]
-
-    def _solved_model(self) -> SensorModel | None:
-        return None if self._belief.state is None else self._belief.state.model
 
     def _posed_readings(self) -> PosedReadings:
         """The readings for the solution of the worlds."""

@@ -87,8 +87,8 @@ class StoppedRun:
         """
         began = False
         for frame in frames:
-            if not self.is_new(frame.timestamp):
-                self._check_known(frame.timestamp)
+            if not self.is_new(frame.timestamp) and not _is_among(np.array([frame.timestamp]), self.timestamps)[0]:
+                raise self._other_input(f"it has a frame at {frame.timestamp:.6f} s, and {FRAMES_NAME} has none")
             if not began and frame.timestamp > self.keyframe_at - _SAME_TIME:
                 began = True
                 if frame.timestamp > self.keyframe_at + _SAME_TIME:
@@ -110,10 +110,6 @@ class StoppedRun:
         atomic_write_text(self.folder / FRAMES_NAME, "".join(lines[: len(self.timestamps) + 1]))
         cut_inertial_records(self.folder, float(self.timestamps[-1]))
         remove_results(self.folder)
-
-    def _check_known(self, timestamp: float) -> None:
-        if not _is_among(np.array([timestamp]), self.timestamps)[0]:
-            raise self._other_input(f"it has a frame at {timestamp:.6f} s, and {FRAMES_NAME} has none")
 
     def _other_input(self, reason: str) -> InputError:
         return InputError(

@@ -60,26 +60,29 @@ class RigWatch:
         fit = self.localiser.fit_near(matches, prediction)
         if fit is None:
             return None
-        chosen = matches.views.select(fit.inliers)
+        chosen, camera = matches.views.select(fit.inliers), self.window.camera
         expected = seen_from(self.window, chosen.landmark, fit.pose)[:, 2] + self.window.posterior.calibration[0]
-        moved = _follow(frame.left, frame.right, np.column_stack([chosen.measurement[:, :2], expected]))
+        moved, places = _follow(frame.left, frame.right, np.column_stack([chosen.measurement[:, :2], expected]))
         before = self.keyframes.active[-1].view
-        usual = _follow(before.left, before.right, before.measured(np.isfinite(before.disparity)))
+        usual, _ = _follow(before.left, before.right, before.measured(np.isfinite(before.disparity)))
         if min(len(moved), len(usual)) < self.localiser.config.min_inliers:
             return None
+        # Of a camera that was turned what is at the border moves farther.
+        middle, rays = np.median(moved, axis=0), (places - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        ways = np.stack([moved, moved - (rays @ middle)[:, None] * rays])
+        spread = _ROBUST * np.median(np.abs(ways - np.median(ways, axis=1, keepdims=True)), axis=1).max(axis=1)
         # Rows that were off before are an error of the calibration, and no change.
-        shift = np.median(moved, axis=0) - (0.0, np.median(usual[:, 1]))
-        spread = _ROBUST * np.median(np.abs(moved - np.median(moved, axis=0)), axis=0)
-        if np.linalg.norm(shift) < ACCEPTANCE.bump or (spread > ACCEPTANCE.bump).any():
+        shift = middle - (0.0, np.median(usual[:, 1]))
+        if np.linalg.norm(shift) < ACCEPTANCE.bump or spread.min() > ACCEPTANCE.bump:
             return None
         return RigChange(fit, -float(shift[0]), float(shift[1]))
 
 
-def _follow(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> np.ndarray:
-    """(M, 2) by how much places of the left image are elsewhere in the right one than (u, v, disparity) (K, 3) say."""
+def _follow(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 2) each: by how much right places depart from where (u, v, disparity) (K, 3) put those on the left; these."""
     uvd = uvd[np.isfinite(uvd).all(axis=1)]
     expected = uvd[:, :2] - np.outer(uvd[:, 2], (1.0, 0.0))
     found, ended = lucas_kanade(left, right, uvd[:, :2], expected, _WINDOW, _LEVELS)
     back, returned = lucas_kanade(right, left, found, uvd[:, :2], _WINDOW, 0)
     good = ended & returned & (np.linalg.norm(back - uvd[:, :2], axis=1) < 1.0)
-    return np.asarray((found - expected)[good])
+    return (found - expected)[good], expected[good]

@@ -143,15 +143,18 @@ class Scrutiny:
         step = se3_inverse(self._window.posterior.poses[-1]) @ fit.pose
         error = time_error(self._motion, step, self._clock.interval, self._had_other_times)
         # What goes on is an acceleration: images out of order jump to and fro.
-        if error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0):
-            doubts.add(Doubt.TIME)
+        is_other = error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0)
+        excess = surprise(self._motion, step)
+        if is_other:
             self._motion.doubt_time(error * self._clock.interval)
+        elif excess > 1.0:
+            self._motion.widen(excess)
+        doubts.prediction_is_wrong, self._had_other_times = is_other or excess > 1.0, self._had_other_times or is_other
+        # Once images of another time came, what motion does not expect may be one.
+        if is_other or (self._had_other_times and self._motion.widened > 1.0):
+            doubts.add(Doubt.TIME)
             # The pose at the stamp is the prediction, as uncertain as it was before, and the image's is off by a way.
             doubts.spread = doubts.spread + Prediction.of(self._window, self._motion).covariance
-            doubts.prediction_is_wrong = self._had_other_times = True
-        elif (excess := surprise(self._motion, step)) > 1.0:
-            self._motion.widen(excess)
-            doubts.prediction_is_wrong = True
         self._last_error = error
 
 

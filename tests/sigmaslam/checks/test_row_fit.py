@@ -113,5 +113,13 @@ def test_a_part_of_a_frame_between_the_eyes_is_measured():
     assert {found[name][0] for name in ("rows", "rotation", "scale", "infinity")} == {"unknown"}
 
 
+def test_a_bump_between_two_pairs_is_no_delay():
+    matches = matches_of()
+    matches.right[matches.pair == 0, 1] += 3.0
+    found = findings_of(matches)
+    assert found["synchronisation"] == ("ok", pytest.approx(0.0, abs=0.02))
+    assert found["rows"][0] == "warning"
+
+
 def test_few_matches_judge_nothing():
     assert {severity for severity, _ in findings_of(matches_of(count=40)).values()} == {"unknown"}

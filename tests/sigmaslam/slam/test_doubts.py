@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
+from sigmaslam.slam.rig_change import RigChange
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import Estimate, StereoTracker
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, shift_image, spoil
@@ -144,24 +147,49 @@ def test_a_bump_is_said_when_it_happens_and_its_offset_is_learned(demo: Demo):
     assert change == pytest.approx(-2.0, abs=float(4.0 * sigma))
 
 
-@pytest.mark.parametrize(("later", "change"), [(0.0, None), (-2.5, -2.5)])
-def test_rows_that_were_off_before_are_no_bump(demo: Demo, later: float, change: float | None):
-    """A frame that fails for another reason is asked for one."""
+def find_bump(demo: Demo, before: float, change: Callable[[np.ndarray], np.ndarray]) -> RigChange | None:
+    """What is found where the right image (H, W) changes after twelve frames with rows lower by `before` pixels."""
     camera, frames, _ = demo
     tracker = StereoTracker(camera)
-    moved = [replace(each, right=shift_image(each.right, 1.3, 0.0)) for each in frames[:13]]
+    moved = [replace(each, right=shift_image(each.right, before, 0.0)) for each in frames[:13]]
     track(tracker, moved[:12])
-    right = shift_image(moved[12].right, later, 0.0)
-    frame = Frame(*tracker.rectifier.rectify(moved[12].left, right), tracker._frontend)
+    frame = Frame(*tracker.rectifier.rectify(moved[12].left, change(moved[12].right)), tracker._frontend)
     tracker._motion.predict(moved[12].timestamp - moved[11].timestamp, np.full(2, 1.0), timestamp=moved[12].timestamp)
     prediction = Prediction.of(tracker._window, tracker._motion)
     views = [each.view for each in tracker._keyframes.active]
     matches = tracker._localiser.guided.match_guided(frame.view, views, prediction.pose, prediction.covariance)
-    found = tracker._rig_watch.find_change(frame, matches, prediction)
+    return tracker._rig_watch.find_change(frame, matches, prediction)
+
+
+@pytest.mark.parametrize(("later", "change"), [(0.0, None), (-2.5, -2.5)])
+def test_rows_that_were_off_before_are_no_bump(demo: Demo, later: float, change: float | None):
+    """A frame that fails for another reason is asked for one."""
+    found = find_bump(demo, 1.3, lambda right: shift_image(right, later, 0.0))
     assert (found is None) == (change is None)
     if found is not None:
         assert found.rows == pytest.approx(change, abs=0.3)
         assert found.columns == pytest.approx(0.0, abs=0.3)
+
+
+def test_a_turn_that_moves_the_border_farther_is_a_bump(demo: Demo):
+    K = demo[0].right.matrix
+    turn = K @ cv2.Rodrigues(np.array([0.0, 12.0 / K[0, 0], 0.0]))[0] @ np.linalg.inv(K)
+    found = find_bump(demo, 0.0, lambda right: cv2.warpPerspective(right, turn, right.shape[::-1]))
+    assert found is not None
+    assert found.columns == pytest.approx(-13.0, abs=1.5)  # 12 in the middle, 18 at the border
+    assert found.rows == pytest.approx(0.0, abs=0.5)
+
+
+@pytest.mark.parametrize("had_other_times", [False, True])
+def test_a_jump_is_doubtful_once_images_of_another_time_came(demo: Demo, had_other_times: bool):
+    camera, frames, _ = demo
+    tracker = StereoTracker(camera)
+    track(tracker, frames[:16])
+    tracker._scrutiny._had_other_times = had_other_times
+    tracker._motion.set_twist(np.zeros(6), np.full(6, 1e-6))
+    (estimate,) = track(tracker, frames[16:17])
+    assert tracker._motion.widened > 1.0
+    assert list(estimate.doubts) == [Doubt.TIME] * had_other_times
 
 
 def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Demo):
