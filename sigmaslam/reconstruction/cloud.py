@@ -105,8 +105,7 @@ class DepthPixels(Table):
 
     def sigma(self, camera: RectifiedStereo) -> np.ndarray:
         """(N,) standard deviation along the ray, metres."""
-        points = self.points(camera)
-        return np.sqrt(np.einsum("ni,ni->n", points, points) * (self.variance / self.disparity**2))
+        return np.linalg.norm(self.points(camera), axis=1) * np.sqrt(self.variance) / self.disparity
 
     def cloud(self, camera: RectifiedStereo, pose: np.ndarray, pose_covariance: np.ndarray) -> DenseCloud:
         """Points in the world.
@@ -150,9 +149,8 @@ class DepthPixels(Table):
 class VoxelCloud:
     """Points that come keyframe by keyframe, one kept per voxel.
 
-    A voxel follows what is known: its side is doubled until it is an eighth of the point's sigma in its keyframe, or
-    more; errors of the pose move all points alike. Points of different sides lie in different voxels; of those the
-    finer ones stay.
+    A voxel's side is doubled until it is an eighth of the point's sigma or more, but for the pose's, which all share.
+    Points of different sides lie in different voxels; of those the finer ones stay.
 
     What falls into a voxel has errors in common, of poses and of texture, in a degree that is not known. Covariance
     intersection with equal weights is consistent whatever it is: the mean of the information, and the mean weighted by
