@@ -105,7 +105,7 @@ class DepthPixels(Table):
 
     def sigma(self, camera: RectifiedStereo) -> np.ndarray:
         """(N,) standard deviation along the ray, metres."""
-        return np.linalg.norm(self.points(camera), axis=1) * np.sqrt(self.variance) / self.disparity
+        return np.asarray(np.linalg.norm(self.points(camera), axis=1) * np.sqrt(self.variance) / self.disparity)
 
     def cloud(self, camera: RectifiedStereo, pose: np.ndarray, pose_covariance: np.ndarray) -> DenseCloud:
         """Points in the world.
