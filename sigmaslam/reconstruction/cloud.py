@@ -103,6 +103,10 @@ class DepthPixels(Table):
         """(N, 3) in the rectified left camera, metres."""
         return camera.triangulate(np.column_stack([self.pixels, self.disparity]))
 
+    def sigma(self, camera: RectifiedStereo) -> np.ndarray:
+        """(N,) standard deviation along the ray, metres."""
+        return np.asarray(np.linalg.norm(self.points(camera), axis=1) * np.sqrt(self.variance) / self.disparity)
+
     def cloud(self, camera: RectifiedStereo, pose: np.ndarray, pose_covariance: np.ndarray) -> DenseCloud:
         """Points in the world.
 
@@ -135,11 +139,8 @@ class DepthPixels(Table):
             pair = camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline
             numbers = pair, size, _SIGMA_SHARE, _MOST_LEVEL
             return self.select(kernels.thin(self.pixels, self.disparity, self.variance, *numbers))
-        points = self.points(camera)
-        relative = self.variance / self.disparity**2
-        sigma = np.sqrt(np.einsum("ni,ni->n", points, points) * relative)
-        order, first = _groups(_voxels(points, sigma, size) @ _ONE_KEY)
-        relative = relative[order]
+        order, first = _groups(_voxels(self.points(camera), self.sigma(camera), size) @ _ONE_KEY)
+        relative = (self.variance / self.disparity**2)[order]
         count = np.diff(np.r_[first, len(order)])
         best = relative == np.repeat(np.minimum.reduceat(relative, first), count)
         return self.select(np.sort(np.minimum.reduceat(np.where(best, order, len(order)), first)))
@@ -148,8 +149,8 @@ class DepthPixels(Table):
 class VoxelCloud:
     """Points that come keyframe by keyframe, one kept per voxel.
 
-    A voxel follows what is known: its side is doubled until it is an eighth of the point's sigma, or more. Points of
-    different sides lie in different voxels; of those the finer ones stay.
+    A voxel's side is doubled until it is an eighth of the point's sigma or more, but for the pose's, which all share.
+    Points of different sides lie in different voxels; of those the finer ones stay.
 
     What falls into a voxel has errors in common, of poses and of texture, in a degree that is not known. Covariance
     intersection with equal weights is consistent whatever it is: the mean of the information, and the mean weighted by
@@ -169,14 +170,14 @@ class VoxelCloud:
         self._merged: tuple[np.ndarray, np.ndarray] = np.zeros((0, 4), np.int64), np.zeros((0, 11))
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def add(self, cloud: DenseCloud) -> None:
-        """Takes the points of a keyframe."""
+    def add(self, cloud: DenseCloud, sigma: np.ndarray) -> None:
+        """Takes the points of a keyframe, and their sigmas (N,) without the pose's, metres."""
         if not len(cloud):
             return
         information = inverse(cloud.covariances.astype(np.float64))
         weighted = _times(information, cloud.points)
         sums = np.column_stack([information, weighted, cloud.intensity * cloud.views, cloud.views])
-        self._pending.append((_voxels(cloud.points, cloud.sigma, self.size), sums))
+        self._pending.append((_voxels(cloud.points, sigma, self.size), sums))
         # Amortised: each point is sorted about as many times as the cloud triples.
         if sum(len(part[0]) for part in self._pending) > min(2 * len(self._merged[0]), self._most):
             self._merge()

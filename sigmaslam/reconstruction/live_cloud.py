@@ -81,8 +81,8 @@ class CloudSink:
         views = {k: (image, view) for k, (_, image, view) in enumerate(self._views)}
         depth = fuse_keyframe(number, views, self._recorded(), self._rectifier)
         self._cloud = self._cloud or VoxelCloud(default_voxel(depth, self._rectifier.rectified))
-        points = depth.cloud(self._rectifier.rectified, self._cloud.size)
-        self._cloud.add(points)
+        points, sigma = depth.cloud(self._rectifier.rectified, self._cloud.size)
+        self._cloud.add(points, sigma)
         if self._show is not None:
             self._show(points.points, points.intensity)
         self._keyframes += 1

@@ -95,10 +95,10 @@ class KeyframeDepth:
         certain = self.variance < (_MAX_SIGMA * self.fused.disparity) ** 2
         return np.asarray(self.fused.is_confirmed & certain)
 
-    def cloud(self, camera: RectifiedStereo, voxel: float) -> DenseCloud:
-        """The points in the world, about one a voxel of that side, metres."""
-        pixels = DepthPixels.of(self.fused.disparity, self.variance, self.image, self.is_point)
-        return pixels.thinned(camera, voxel).cloud(camera, self.pose, self.pose_covariance)
+    def cloud(self, camera: RectifiedStereo, voxel: float) -> tuple[DenseCloud, np.ndarray]:
+        """The points in the world, about one a voxel of that side, metres; and their sigmas (N,) by the depth alone."""
+        pixels = DepthPixels.of(self.fused.disparity, self.variance, self.image, self.is_point).thinned(camera, voxel)
+        return pixels.cloud(camera, self.pose, self.pose_covariance), pixels.sigma(camera)
 
 
 def reconstruct_run(
@@ -152,7 +152,7 @@ def reconstruct_run(
             if cloud is None:
                 cloud = VoxelCloud(voxel or default_voxel(depth, camera))
                 volume = None if mesh is None else DepthVolume(cloud.size, camera)
-            cloud.add(depth.cloud(camera, cloud.size))
+            cloud.add(*depth.cloud(camera, cloud.size))
             if posed is not None:
                 posed.add(depth.image, depth.pose)
             if volume is not None:

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from sigmaslam_filters.core.sigma_points import cubature
-from sigmaslam_filters.core.transforms import Unscented
 from sigmaslam_filters.graphs.exact_operators import ExactOperators
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3, skew
 
@@ -50,35 +49,29 @@ class InertialPredict(nn.Module):
         walk: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sigma points through the motion; noise is added after."""
-
-        def advance(offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            mount = exp_se3(offsets[:, MOUNTING]) @ mounting
-            body = exp_se3(offsets[:, POSE]) @ pose @ mount
-            change = offsets[:, BIASES_TO_FACTORS] @ slope.transpose(0, 1)
+        # One evaluation of all points, the centre last: a graph spends its time on operators, not on their rows.
+        with ExactOperators():
+            points = cubature().offsets(root, with_centre=True)
+            change = points[:, BIASES_TO_FACTORS] @ slope.transpose(0, 1)
+            turned = torch.cat([torch.zeros_like(change[:, :3]), change[:, :3]], dim=-1)
+            offset, mount, turned = exp_se3(torch.stack([points[:, POSE], points[:, MOUNTING], turned]))
+            mount = mount @ mounting
+            body = offset @ pose @ mount
             R, p = body[:, :3, :3], body[:, :3, 3]
-            v, g = velocity + offsets[:, VELOCITY], gravity + offsets[:, GRAVITY]
+            v, g = velocity + points[:, VELOCITY], gravity + points[:, GRAVITY]
             gained = (R @ (velocity_change + change[:, 3:6]).unsqueeze(-1)).squeeze(-1)
             moved = (R @ (position_change + change[:, 6:]).unsqueeze(-1)).squeeze(-1)
             place = p + v * seconds + g * (seconds * seconds * 0.5) + moved
-            turned = exp_se3(torch.cat([torch.zeros_like(change[:, :3]), change[:, :3]], dim=-1))[:, :3, :3]
-            top = torch.cat([R @ turn @ turned, place.unsqueeze(-1)], dim=-1)
-            after = torch.cat([top, body[:, 3:]], dim=-2)
-            return after @ invert_se3(mount), v + g * seconds + gained, after
-
-        origin = torch.zeros_like(root[:1])
-        predicted, speed, body = (each[0] for each in advance(origin))
-        back = invert_se3(predicted)
-
-        def moved(offsets: Tensor) -> Tensor:
-            camera, v, _ = advance(offsets)
-            return torch.cat([log_se3(camera @ back), v - speed, offsets[:, 9:]], dim=-1)
-
-        with ExactOperators():
-            state = Unscented(cubature())(moved, root, None)
-            mean, spread = state.mean, state.columns.covariance()
-            carried = root @ state.columns.odd.transpose(0, 1)
+            top = torch.cat([R @ turn @ turned[:, :3, :3], place.unsqueeze(-1)], dim=-1)
+            body = torch.cat([top, body[:, 3:]], dim=-2)
+            camera, v = body @ invert_se3(mount), v + g * seconds + gained
+            predicted, speed = camera[-1], v[-1]
+            local = torch.cat([log_se3(camera @ invert_se3(predicted)), v - speed, points[:, 9:]], dim=-1)[:-1]
+            mean = cubature().mean(local, STATE_SIZE, with_centre=False)
+            columns = cubature().deviations(local, mean, STATE_SIZE, with_centre=False)
+            spread, carried = columns.covariance(), root @ columns.odd.transpose(0, 1)
         start = pose @ mounting
-        added = _process_noise(start[:3, :3], body, noise, walk * seconds)
+        added = _process_noise(start[:3, :3], body[-1], noise, walk * seconds)
         return exp_se3(mean[POSE]) @ predicted, speed + mean[VELOCITY], spread + added, carried
 
 

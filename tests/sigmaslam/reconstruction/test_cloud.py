@@ -48,10 +48,14 @@ def _points(points: list[list[float]], variances: list[float]) -> DenseCloud:
     return DenseCloud(np.array(points), six, np.full(len(points), 100.0, np.float32), np.ones(len(points), np.int32))
 
 
+def _add(voxels: VoxelCloud, cloud: DenseCloud) -> None:
+    voxels.add(cloud, cloud.sigma)
+
+
 def test_points_of_a_voxel_are_weighted_by_information_and_gain_none():
     voxels = VoxelCloud(1.0)
-    voxels.add(_points([[0.2, 0.5, 0.5], [3.5, 0.5, 0.5]], [1.0, 4.0]))
-    voxels.add(_points([[0.8, 0.5, 0.5]], [0.5]))
+    _add(voxels, _points([[0.2, 0.5, 0.5], [3.5, 0.5, 0.5]], [1.0, 4.0]))
+    _add(voxels, _points([[0.8, 0.5, 0.5]], [0.5]))
     cloud = voxels.cloud()
     assert cloud.views.tolist() == [2, 1]
     np.testing.assert_allclose(cloud.points, [[0.6, 0.5, 0.5], [3.5, 0.5, 0.5]], rtol=1e-9)
@@ -62,20 +66,27 @@ def test_points_of_a_voxel_are_weighted_by_information_and_gain_none():
 def test_voxels_follow_sigma_and_finer_points_take_the_place_of_coarser_ones():
     voxels = VoxelCloud(0.1)
     coarse = [[x, 0.5, 0.5] for x in (0.05, 0.15, 0.25, 0.35, 5.05, 5.15)]
-    voxels.add(_points(coarse, [3.2**2] * 6))
+    _add(voxels, _points(coarse, [3.2**2] * 6))
     # An eighth of 3.2 m is four times the side.
     assert len(voxels.cloud()) == 2
-    voxels.add(_points([[0.12, 0.5, 0.5]], [0.5**2]))
+    _add(voxels, _points([[0.12, 0.5, 0.5]], [0.5**2]))
     cloud = voxels.cloud()
     assert cloud.views.tolist() == [1, 2]
     np.testing.assert_allclose(cloud.sigma, [0.5, 3.2], rtol=1e-5)
 
 
+def test_an_uncertain_pose_makes_no_voxel_coarser():
+    voxels = VoxelCloud(0.1)
+    cloud = _points([[x, 0.5, 0.5] for x in (0.05, 0.15, 0.25, 0.35)], [3.2**2] * 4)
+    voxels.add(cloud, np.full(4, 0.5))
+    np.testing.assert_allclose(voxels.cloud().sigma, [3.2] * 4, rtol=1e-5)
+
+
 def test_points_of_too_few_views_are_left_out():
     voxels = VoxelCloud(1.0)
     for _ in range(2):
-        voxels.add(_points([[0.5, 0.5, 0.5]], [1.0]))
-    voxels.add(_points([[3.5, 0.5, 0.5]], [1.0]))
+        _add(voxels, _points([[0.5, 0.5, 0.5]], [1.0]))
+    _add(voxels, _points([[3.5, 0.5, 0.5]], [1.0]))
     np.testing.assert_allclose(voxels.cloud(min_views=2).points, [[0.5, 0.5, 0.5]])
     assert len(voxels.cloud(min_views=3)) == 0
 
@@ -88,7 +99,7 @@ def test_the_order_in_which_keyframes_come_does_not_matter():
     for order, most in ((parts, 1000), (parts[::-1], 1000), (parts, 20)):
         voxels = VoxelCloud(0.7, most)
         for part in order:
-            voxels.add(part)
+            _add(voxels, part)
             assert len(voxels._merged[0]) <= most
         clouds.append(voxels.cloud())
     for other in clouds[1:]:
