@@ -31,7 +31,7 @@ def adapted_noise(noise: Diagonal | Dense, update: Update, value: Tensor, rate: 
     size, R = noise.variance().shape[-1], entered.covariance()
     gain = torch.linalg.solve(update.innovation_covariance, R).mT
     residual = gain @ update.innovation.unsqueeze(-1)
-    shown = _blocks(residual @ residual.mT + R - gain @ R, size)
+    shown = Dense(residual @ residual.mT + R - gain @ R).blocks(size)
     there = torch.isfinite(value).unflatten(-1, (-1, size)) & update.healthy[..., None, None]
     if update.weight is not None:
         weight = update.weight.repeat_interleave(there.shape[-2] // update.weight.shape[-1], dim=-1).unsqueeze(-1)
@@ -48,8 +48,3 @@ def adapted_noise(noise: Diagonal | Dense, update: Update, value: Tensor, rate: 
     total = torch.where(whole[..., None, None], shown, 0.0).sum(dim=-3)
     R = noise.covariance()
     return Dense(torch.where(number > 0, torch.lerp(R, total / number.clamp_min(1), rate), R))
-
-
-def _blocks(matrix: Tensor, size: int) -> Tensor:
-    """Blocks (..., m / size, size, size) on the diagonal of (..., m, m)."""
-    return Dense(matrix).blocks(size)

@@ -1,7 +1,7 @@
 """Beliefs by samples: the bootstrap particle filter (Gordon et al. 1993), (9.21), and the ensemble Kalman filter."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,10 +25,12 @@ class Particles:
     Attributes:
         states: (N, ..., p), as the models' functions take them.
         log_weights: (N, ...) whose exponentials add up to 1.
+        beliefs: batch (N, ...), what each particle knows of the part of the state that is not sampled, see `weigh`.
     """
 
     states: Tensor
     log_weights: Tensor
+    beliefs: Gaussian | None = None
 
     __repr__ = shapes_of
 
@@ -64,10 +66,10 @@ class ParticleFilter:
         factor = as_noise(motion.noise).factor()
         noise = apply(factor, self._normal((*states.shape[:-1], factor.shape[-1]), states))
         if not isinstance(motion, LinearMotion) and not motion.additive:
-            return Particles(motion.evaluate(states, noise, *inputs), particles.log_weights)
+            return replace(particles, states=motion.evaluate(states, noise, *inputs))
         if motion.noise_matrix is not None:
             noise = apply(motion.noise_matrix, noise)
-        return Particles(self._retract(motion.evaluate(states, *inputs), noise), particles.log_weights)
+        return replace(particles, states=self._retract(motion.evaluate(states, *inputs), noise))
 
     def update(
         self, particles: Particles, measurement: AnyMeasurement, value: Tensor, *inputs: Tensor
@@ -85,9 +87,17 @@ class ParticleFilter:
         difference, noise, present = _differences(particles.states, measurement, value, inputs)
         white = noise.whitened(difference.unsqueeze(-1)).squeeze(-1)
         constant = noise.log_determinant() + present.sum(dim=-1) * math.log(2.0 * math.pi)
-        log_weights = particles.log_weights - 0.5 * (white.square().sum(dim=-1) + constant)
+        return self.weigh(particles, -0.5 * (white.square().sum(dim=-1) + constant))
+
+    def weigh(self, particles: Particles, log_likelihood: Tensor) -> tuple[Particles, Tensor]:
+        """As `update`, given the log-likelihood (N, ...) of a measurement by each particle.
+
+        So Rao-Blackwellised particles (Doucet et al. 2000) sample a part of the state alone. A Kalman filter has the
+        others as a batch, `beliefs`, whose matrices may depend on the samples: its updates say the log-likelihoods.
+        """
+        log_weights = particles.log_weights + log_likelihood
         likelihood = torch.logsumexp(log_weights, dim=0)
-        return self._resampled(Particles(particles.states, log_weights - likelihood)), likelihood
+        return self._resampled(replace(particles, log_weights=log_weights - likelihood)), likelihood
 
     def gaussian(self, particles: Particles) -> Gaussian:
         """Mean and covariance of the particles, in the chart at the mean."""
@@ -115,12 +125,17 @@ class ParticleFilter:
         first = torch.rand(poor.shape, generator=self.generator, dtype=total.dtype, device=total.device)
         steps = torch.arange(number, dtype=total.dtype, device=total.device)
         at = ((steps + first.unsqueeze(-1)) / number * total[..., -1:]).contiguous()
-        drawn = torch.searchsorted(total, at).clamp_max(number - 1).movedim(-1, 0)
-        states = particles.states.gather(0, drawn.unsqueeze(-1).expand_as(particles.states))
-        equal = torch.full_like(particles.log_weights, -math.log(number))
-        return Particles(
-            torch.where(poor.unsqueeze(-1), states, particles.states), torch.where(poor, equal, particles.log_weights)
-        )
+        drawn = torch.searchsorted(total, at).clamp_max(number - 1)
+        drawn = torch.where(poor.unsqueeze(-1), drawn, steps.long()).movedim(-1, 0)
+
+        def taken(given: Tensor) -> Tensor:
+            return given.gather(0, drawn[(..., *[None] * (given.ndim - drawn.ndim))].expand_as(given))
+
+        beliefs = particles.beliefs
+        if beliefs is not None:
+            beliefs = Gaussian(taken(beliefs.mean), taken(beliefs.covariance), is_symmetric=True)
+        log_weights = torch.where(poor, -math.log(number), particles.log_weights)
+        return Particles(taken(particles.states), log_weights, beliefs)
 
     def _normal(self, shape: tuple[int, ...], like: Tensor) -> Tensor:
         return torch.randn(shape, generator=self.generator, dtype=like.dtype, device=like.device)
@@ -152,7 +167,7 @@ class EnsembleKalmanFilter(ParticleFilter):
         white = torch.linalg.solve_triangular(root, innovation.unsqueeze(-1), upper=False).squeeze(-1)
         squared = white.square().sum(dim=-1) + present.sum(dim=-1) * math.log(2.0 * math.pi)
         likelihood = -0.5 * squared - torch.diagonal(root, dim1=-2, dim2=-1).log().sum(dim=-1)
-        return Particles(states, particles.log_weights), likelihood
+        return replace(particles, states=states), likelihood
 
 
 def _differences(

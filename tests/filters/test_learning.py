@@ -62,6 +62,39 @@ def test_a_step_of_expectation_maximisation_ascends_as_the_gradient_does():
         assert float(last.abs().max()) < 0.05 * float(first.abs().max())
 
 
+@pytest.mark.long
+def test_noise_of_a_pendulum_s_shadow_with_parts_missing_is_where_the_likelihood_is_largest():
+    """Nonlinear models, inputs by time, a residual, and components that are missing one by one."""
+    generator, seconds = torch.Generator().manual_seed(0), tensor(0.1, 0.2)[torch.arange(39) % 2].unsqueeze(-1)
+
+    def swing(state: Tensor, dt: Tensor) -> Tensor:
+        angle, rate = state.unbind(-1)
+        return filters.stack([angle + dt[..., 0] * rate, rate - dt[..., 0] * torch.sin(angle)])
+
+    def differ(measured: Tensor, predicted: Tensor) -> Tensor:
+        difference = measured - predicted
+        return filters.stack([filters.wrap_angle(difference[..., 0]), difference[..., 1]])
+
+    process, noise = torch.diag(tensor(0.1, 0.2)), tensor(0.05, 0.03, 0.03, 0.1).view(2, 2)
+    model = filters.MotionModel(swing, process)
+    see = filters.MeasurementModel(lambda x: x + 0.2 * torch.sin(x), noise, residual=differ)
+    state, values = random_numbers(60, 2), []
+    for k in range(40):
+        draws = torch.randn(2, 60, 2, generator=generator, dtype=torch.float64)
+        values.append(differ(see.function(state), draws[0] @ torch.linalg.cholesky(noise).mT))
+        state = model.function(state, seconds[min(k, 38)]) + draws[1] @ process.sqrt()
+    given = torch.stack(values)
+    given[torch.rand(given.shape, generator=generator, dtype=torch.float64) < 0.2] = torch.nan
+    far = filters.MotionModel(swing, 0.3 * EYE), filters.MeasurementModel(see.function, 0.3 * EYE, residual=differ)
+    found = filters.fit_noise(PRIOR, *far, given, 5, seconds)
+    assert float(found.log_likelihood.diff().min()) > 10.0
+    stays = filters.fit_noise(PRIOR, model, see, given, 4, seconds)
+    assert_close(stays.motion.noise, process, 0.02)
+    assert_close(stays.measurement.noise, noise, 0.02)
+    rise = stays.log_likelihood[-1] - stays.log_likelihood[0]
+    assert 0.0 < float(rise) < 0.1 * float(stays.log_likelihood[0] - found.log_likelihood[-1])
+
+
 def test_derivatives_of_the_likelihood_forward_and_backward_agree():
     values = sequences(4, 2)
 
@@ -89,10 +122,8 @@ def test_filters_can_be_mapped_over_parameters():
 
 
 def test_sequences_that_cannot_be_fitted_are_refused():
-    values = sequences(5, 1)
-    values[2, 0, 1] = torch.nan
-    motion, see = filters.LinearMotion(A, Q), filters.LinearMeasurement(H, R)
-    with pytest.raises(ValueError, match="some components missing"):
-        filters.fit_noise(PRIOR, motion, see, values)
+    values, motion, see = sequences(5, 1), filters.LinearMotion(A, Q), filters.LinearMeasurement(H, R)
+    with pytest.raises(TypeError, match="fit_noise is for states in R"):
+        filters.fit_noise(PRIOR, motion, see, values, bayes=filters.UnscentedKalmanFilter(filters.SE2()))
     with pytest.raises(ValueError, match="without noise_matrix"):
         filters.fit_noise(PRIOR, filters.LinearMotion(A, Q, noise_matrix=EYE), see, values)

@@ -1,5 +1,7 @@
 """The particle filter against the Kalman filter, on a manifold, and where no Gaussian does."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -94,3 +96,34 @@ def test_an_ensemble_s_heading_crosses_the_cut():
     found = cloud.gaussian(cloud.update(cloud.sample(belief, NUMBER), see, value)[0])
     expected = filters.UnscentedKalmanFilter(space).update(belief, see, value).belief
     assert_close(space.local(expected.mean, found.mean), tensor(0.0, 0.0, 0.0), 0.02)
+
+
+@pytest.mark.long
+def test_rao_blackwellised_particles_sample_a_part_and_filter_the_rest():
+    """One shift of three walks is sampled, the walks are filtered; together they are a linear model."""
+    generator, eye, number = torch.Generator().manual_seed(0), torch.eye(4, dtype=torch.float64), 300
+    A, Q, H = 0.9 * eye, 0.3 * covariances(4, seed=2), torch.cat([torch.ones_like(eye[:3, :1]), eye[:3, :3]], dim=-1)
+    Q[0, 1:] = Q[1:, 0] = 0.0
+    motion, see = filters.LinearMotion(A, Q), filters.LinearMeasurement(H, 0.1 * eye[:3, :3])
+    shift, walks = filters.LinearMotion(A[:1, :1], Q[:1, :1]), filters.LinearMotion(A[1:, 1:], Q[1:, 1:])
+    alone = filters.LinearMeasurement(eye[:3, :3], see.noise)
+    bayes, cloud = filters.KalmanFilter(), filters.ParticleFilter(generator)
+    belief = filters.Gaussian(torch.zeros(20, 4, dtype=torch.float64), eye)
+    plain, particles = cloud.sample(belief, number), cloud.sample(belief.marginal([0]), number)
+    particles = dataclasses.replace(particles, beliefs=belief.marginal([1, 2, 3]).expand((number, 20)))
+    errors = torch.zeros(2, 2)
+    for value in random_numbers(15, 20, 3, seed=5):
+        update = bayes.update(bayes.predict(belief, motion).belief, see, value)
+        plain, by_samples = cloud.update(cloud.predict(plain, motion), see, value)
+        particles = cloud.predict(particles, shift)
+        moved = bayes.predict(particles.beliefs, walks).belief
+        seen = bayes.update(moved, alone, value - particles.states)
+        particles, likelihood = cloud.weigh(dataclasses.replace(particles, beliefs=seen.belief), seen.log_likelihood)
+        belief = update.belief
+        first = (particles.log_weights.exp().unsqueeze(-1) * particles.beliefs.mean).sum(dim=0)
+        mean = torch.cat([cloud.gaussian(particles).mean, first], dim=-1)
+        for k, (found, said) in enumerate(((mean, likelihood), (cloud.gaussian(plain).mean, by_samples))):
+            errors[k, 0] += (found - belief.mean).square().mean()
+            errors[k, 1] += (said - update.log_likelihood).square().mean()
+    assert bool((errors[0] < 0.25 * errors[1]).all())
+    assert float(errors[0, 0]) / 15 < 0.1**2

@@ -9,7 +9,6 @@ from sigmaslam_filters.consistency.statistics import (
     chi_square_band,
     coverage,
     nees,
-    nis,
     whiten,
     whiteness,
 )
@@ -23,7 +22,6 @@ __all__ = [
     "chi_square_band",
     "coverage",
     "nees",
-    "nis",
     "whiten",
     "whiteness",
 ]

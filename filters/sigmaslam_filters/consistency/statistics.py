@@ -66,12 +66,6 @@ class Consistency:
         return self.mean / self.dof if self.dof > 0 else math.nan
 
     @property
-    def normalised_interval(self) -> tuple[float, float]:
-        """Interval of the mean per degree of freedom."""
-        low, high = self.interval
-        return (low / self.dof, high / self.dof) if self.dof > 0 else (math.nan, math.nan)
-
-    @property
     def consistent(self) -> bool:
         """The interval holds the degrees of freedom and no value is NaN; False for one run, which shows no interval."""
         low, high = self.interval
@@ -146,7 +140,7 @@ def whiten(error: Tensor, covariance: Tensor | None = None, *, factor: Tensor | 
 
 
 def nees(error: Tensor, covariance: Tensor | None = None, *, factor: Tensor | None = None) -> Tensor:
-    """Normalised estimation error squared, x^T P^-1 x.
+    """Normalised estimation error squared, x^T P^-1 x; of an innovation and its covariance the NIS.
 
     Arguments and errors as `whiten`; an error of a pose is its tangent vector, in the units and the frame of P.
 
@@ -154,11 +148,6 @@ def nees(error: Tensor, covariance: Tensor | None = None, *, factor: Tensor | No
         (...,) chi-square with n degrees of freedom where the filter is consistent; NaN as in `whiten`.
     """
     return whiten(error, covariance, factor=factor).square().sum(dim=-1)
-
-
-def nis(innovation: Tensor, covariance: Tensor | None = None, *, factor: Tensor | None = None) -> Tensor:
-    """Normalised innovation squared, e^T S^-1 e: `nees` of an innovation and its covariance, which needs no truth."""
-    return nees(innovation, covariance, factor=factor)
 
 
 def chi_square_band(dof: float, runs: int = 1, probability: float = 0.95) -> tuple[float, float]:
@@ -186,7 +175,7 @@ def check_nees(values: Tensor, dof: float | Tensor, probability: float = 0.95) -
     """Compare NEES or NIS of independent runs with the chi-square distribution.
 
     Args:
-        values: (runs, steps) from `nees` or `nis`.
+        values: (runs, steps) from `nees`.
         dof: degrees of freedom: a number, (steps,) or (runs, steps). 0 where there was no measurement; the value there
             is ignored, NaN or not.
         probability: of the bands and of the interval of the mean.

@@ -76,11 +76,9 @@ class Unscented:
         reference = values[-1]
         local = difference(values, reference)
         mean = self.points.mean(local, size, with_centre)
-        if recentre is None:
-            return Transformed(reference, mean, self.points.deviations(local, mean, size, with_centre))
-        reference = recentre(reference, mean)
-        mean = torch.zeros_like(mean)
-        local = difference(values, reference)
+        if recentre is not None:
+            reference = recentre(reference, mean)
+            mean, local = torch.zeros_like(mean), difference(values, reference)
         return Transformed(reference, mean, self.points.deviations(local, mean, size, with_centre))
 
 
