@@ -109,28 +109,23 @@ class CalibrationEvidence:
 
     def learn(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> None:
         """Takes what all views of the window say, about the mean of its prior, unless it contradicts earlier ones."""
-        state = self._given(about, information, vector)
-        self._posterior = state if self._is_heard(state) else self._prior
+        self._posterior, _ = self._given(about, information, vector)
 
     def marginalise_oldest(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> None:
         """Takes what the views of leaving landmarks say, likewise, and forgets the oldest pose."""
-        state = self._given(about, information, vector)
-        self._contradicted = 0 if self._agrees(state) else self._contradicted + 1
-        state = (state if self._is_heard(state) else self._prior).marginalise_oldest()
+        state, agrees = self._given(about, information, vector)
+        self._contradicted = 0 if agrees else self._contradicted + 1
+        state = state.marginalise_oldest()
         self._prior = replace(state, past=state.past.drop(0))
 
-    def _given(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> WindowState:
+    def _given(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> tuple[WindowState, bool]:
+        """The prior with what views say, if they are heard; whether they speak of the same pair as all before them."""
         vector = vector + information @ about.minus(self._prior)
-        return self._prior.given(information, vector, self._condition)
-
-    def _is_heard(self, state: WindowState) -> bool:
-        return self._agrees(state) or self._contradicted > _PATIENCE
-
-    def _agrees(self, state: WindowState) -> bool:
-        """Whether the views that lead from the prior to a state speak of the same pair as all views before them."""
+        state = self._prior.given(information, vector, self._condition)
         before, after = self._shown(self._prior), self._shown(state)
         views = after[0] - before[0], after[1] - before[1]
-        return _evidence(*after) - _evidence(*before) - _evidence(*views) > _CONTRADICTION
+        agrees = _evidence(*after) - _evidence(*before) - _evidence(*views) > _CONTRADICTION
+        return state if agrees or self._contradicted >= _PATIENCE else self._prior, agrees
 
     def _shown(self, state: WindowState) -> tuple[np.ndarray, np.ndarray]:
         """L (15, 15) and y (15,) of a state in the usual sigmas, by the part that views count."""
