@@ -155,7 +155,7 @@ class StereoSequence:
         """
         self.skipped = []
         failures, any_read = 0, False
-        with closing(read_ahead(lambda: self._convert(self._pairs), READ_AHEAD)) as items:
+        with closing(self._items()) as items:
             for item in items:
                 if isinstance(item, StereoFrame):
                     failures, any_read = 0, True
@@ -190,6 +190,9 @@ class StereoSequence:
         with closing(self._convert(items)) as converted:
             frames = {item.index: item for item in converted if isinstance(item, StereoFrame)}
         return [(frames[first], frames.get(first + 1)) for first in firsts if first in frames]
+
+    def _items(self) -> Generator[StereoFrame | SkippedFrame, None, None]:
+        return read_ahead(lambda: self._convert(self._pairs), READ_AHEAD)
 
     def _convert(self, pairs: Iterable[RawPair | SkippedFrame]) -> Generator[StereoFrame | SkippedFrame, None, None]:
         for item in pairs:
