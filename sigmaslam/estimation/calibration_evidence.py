@@ -11,6 +11,9 @@ is wrong" is a ratio of Savage and Dickey in closed form (Dickey 1971; Bishop 20
 and what it makes of all errors is N(P' y, P') with P'^-1 = L + (S + s^2 w w^T)^-1. No view is linearised again.
 Neighbours err alike, and so do textures followed anew: for the variances of what is found L is divided by a factor.
 
+A pair is the same all along. Views that speak of another one than all before them, by the ratio of the marginal
+likelihoods of one pair and of two, come of a wrong pose or a loop, and are not heard.
+
 A calibration that is worse than usual is so in many errors at once: of the factors by which all their standard
 deviations may be larger, beside the hypotheses, the one of the largest marginal likelihood is taken (empirical Bayes,
 "type 2 maximum likelihood": Bishop 2006, section 3.5). Where the usual ones suffice it is one.
@@ -34,6 +37,9 @@ _SIZE = 0.01
 # A file may claim that a calibration has no errors at all, as a share of the focal length.
 _LEAST_SIGMA = 1e-6
 _ALIKE = 8.0  # of streets, seeds 301 to 304, 700 to 704, 711 and 712
+# Views of one keyframe in a thousand are of a wrong pose (-100 to -100,000 nats, others have -10 at worst). They stay
+# in the window for six keyframes; what contradicts for longer than two windows is right.
+_CONTRADICTION, _PATIENCE = np.log(0.001), 12
 _WORSE = np.geomspace(1.0, 8.0, 13)  # V1 01 and KITTI have 2 to 8; a finer grid says no more of so few errors
 HYPOTHESES = {
     "offset": ("offset",),  # a principal point
@@ -85,6 +91,7 @@ class CalibrationEvidence:
         self.expected = np.zeros(len(ERRORS)) if expected is None else expected.copy()
         state = WindowState.initial(CalibrationPrior.independent(self._sigma, *ERRORS))
         self._prior = self._posterior = replace(state, calibration=self.expected.copy())
+        self._contradicted = 0
 
     def restart(self) -> None:
         """Forgets all poses."""
@@ -101,22 +108,39 @@ class CalibrationEvidence:
         self._prior = self._prior.moved(step, self._prior.covariance, self._prior.common)
 
     def learn(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> None:
-        """Takes what all views of the window say, about the mean of its prior."""
-        self._posterior = self._given(about, information, vector)
+        """Takes what all views of the window say, about the mean of its prior, unless it contradicts earlier ones."""
+        state = self._given(about, information, vector)
+        self._posterior = state if self._is_heard(state) else self._prior
 
     def marginalise_oldest(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> None:
-        """Takes what the views of leaving landmarks say, and forgets the oldest pose."""
-        state = self._given(about, information, vector).marginalise_oldest()
+        """Takes what the views of leaving landmarks say, likewise, and forgets the oldest pose."""
+        state = self._given(about, information, vector)
+        self._contradicted = 0 if self._agrees(state) else self._contradicted + 1
+        state = (state if self._is_heard(state) else self._prior).marginalise_oldest()
         self._prior = replace(state, past=state.past.drop(0))
 
     def _given(self, about: WindowState, information: np.ndarray, vector: np.ndarray) -> WindowState:
         vector = vector + information @ about.minus(self._prior)
         return self._prior.given(information, vector, self._condition)
 
+    def _is_heard(self, state: WindowState) -> bool:
+        return self._agrees(state) or self._contradicted > _PATIENCE
+
+    def _agrees(self, state: WindowState) -> bool:
+        """Whether the views that lead from the prior to a state speak of the same pair as all views before them."""
+        before, after = self._shown(self._prior), self._shown(state)
+        views = after[0] - before[0], after[1] - before[1]
+        return _evidence(*after) - _evidence(*before) - _evidence(*views) > _CONTRADICTION
+
+    def _shown(self, state: WindowState) -> tuple[np.ndarray, np.ndarray]:
+        """L (15, 15) and y (15,) of a state in the usual sigmas, by the part that views count."""
+        mean, _, precision = self._in_usual_sigmas(state)
+        return (precision - np.eye(len(ERRORS))) / _ALIKE, precision @ mean / _ALIKE
+
     def weigh(self) -> dict[str, Cause]:
         """What may be wrong, by its name, unless it is hopeless; "nothing" has the rest of the probability."""
         usual, sigma = np.eye(len(ERRORS)), self._sigma
-        mean, covariance, precision = self._in_usual_sigmas()
+        mean, covariance, precision = self._in_usual_sigmas(self._posterior)
         found: dict[str, tuple[float, float, float]] = {}
         for name in HYPOTHESES:
             spread = self._spreads[name]
@@ -137,9 +161,7 @@ class CalibrationEvidence:
         Returns:
             (15,) the errors that they show, by the usual sigmas; by what factor these errors are larger, 1 or more.
         """
-        identity = np.eye(len(ERRORS))
-        mean, _, precision = self._in_usual_sigmas()
-        vector, information = precision @ mean / _ALIKE, (precision - identity) / _ALIKE
+        identity, (information, vector) = np.eye(len(ERRORS)), self._shown(self._posterior)
         spreads = [np.sqrt(cause.probability) * self._spreads[name] for name, cause in causes.items()]
         more = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
         shown = np.isin(ERRORS, SHOWN) & self._is_uncertain
@@ -151,7 +173,13 @@ class CalibrationEvidence:
             likelihoods.append(vector @ errors[-1] - np.linalg.slogdet(seen)[1])
         return np.where(shown, errors[0] * self._sigma, 0.0), float(_WORSE[int(np.argmax(likelihoods))])
 
-    def _in_usual_sigmas(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _in_usual_sigmas(self, state: WindowState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean (15,), covariance and precision (15, 15) of the errors in the usual sigmas: S is the identity there."""
-        covariance = self._posterior.covariance[CALIBRATION, CALIBRATION] / np.outer(self._sigma, self._sigma)
-        return (self._posterior.calibration - self.expected) / self._sigma, covariance, np.linalg.inv(covariance)
+        covariance = state.covariance[CALIBRATION, CALIBRATION] / np.outer(self._sigma, self._sigma)
+        return (state.calibration - self.expected) / self._sigma, covariance, np.linalg.inv(covariance)
+
+
+def _evidence(information: np.ndarray, vector: np.ndarray) -> float:
+    """Log marginal likelihood of exp(-x^T L x / 2 + y^T x) for errors x of any pair, up to a constant."""
+    seen = np.eye(len(ERRORS)) + _WORSE[-1] ** 2 * information
+    return float(0.5 * _WORSE[-1] ** 2 * vector @ np.linalg.solve(seen, vector) - 0.5 * np.linalg.slogdet(seen)[1])

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from sigmaslam.estimation.calibration_correction import change_rig
 from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, TURNS, CalibrationPrior
-from sigmaslam.estimation.calibration_evidence import _ALIKE, _WORSE, HYPOTHESES, CalibrationEvidence, Cause
+from sigmaslam.estimation.calibration_evidence import _ALIKE, _PATIENCE, _WORSE, HYPOTHESES, CalibrationEvidence, Cause
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.inference.backends import load_step
@@ -94,6 +94,30 @@ def test_errors_count_from_what_is_expected():
     # What is learned is about the window's prior mean, which is zero.
     assert weigh(slopes, slopes @ expected, expected) == {}
     assert weigh(slopes, slopes @ expected)["offset"].probability > 0.99
+
+
+def leave(evidence: CalibrationEvidence, slopes: np.ndarray, measured: np.ndarray) -> None:
+    """A keyframe leaves whose views measure the calibration alone."""
+    step = np.eye(4), 1e-4 * np.eye(6)
+    evidence.add_keyframe(*step)
+    about, slopes = WindowState.initial(USUAL).grow(*step, np.zeros(len(ERRORS))), np.pad(slopes, ((0, 0), (0, 6)))
+    evidence.marginalise_oldest(about, slopes.T @ slopes / NOISE**2, slopes.T @ measured / NOISE**2)
+    evidence.learn(WindowState.initial(USUAL), np.zeros(2 * (len(ERRORS),)), np.zeros(len(ERRORS)))
+
+
+def test_views_of_another_pair_are_not_heard_until_they_go_on_for_two_windows():
+    (slopes, measured), (_, others) = measurements(3, "yaw", 2.0), measurements(3, "yaw", -2.0)
+    evidence = CalibrationEvidence(USUAL, CAMERA.fx, load_step("window_condition"))
+    leave(evidence, slopes, measured)
+    alone, _ = evidence.beside({})
+    leave(evidence, slopes, measured)
+    agreed, _ = evidence.beside({})
+    assert np.abs(agreed - alone).max() > 0.01
+    for _ in range(_PATIENCE):
+        leave(evidence, slopes, others)
+        np.testing.assert_array_equal(evidence.beside({})[0], agreed)
+    leave(evidence, slopes, others)
+    assert np.abs(evidence.beside({})[0] - agreed).max() > 0.01
 
 
 # Of `dense_window`: considered errors of calibrations, of which it estimates the first three.
