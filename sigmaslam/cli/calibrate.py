@@ -80,6 +80,7 @@ def board(
             "into OUT-camchain-imucam.yaml, by a board before the moved rig, or by a run of `track --imu off`.",
         ),
     ] = None,
+    seed: Annotated[int, typer.Option(help="Of the resamples of images that sigmas are compared with.")] = 0,
 ) -> None:
     """Calibrate a stereo pair, or one camera, from images of a board, with the covariance of all parameters."""
     if out.suffix.lower() not in (".yaml", ".yml"):
@@ -112,7 +113,7 @@ def board(
         result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
     with open_progress() as progress:
         task = progress.add_task("sigmas", total=RESAMPLES, note="")
-        result = widened(result, bootstrap_rigs(result, RESAMPLES, 0, lambda: progress.advance(task)))
+        result = widened(result, bootstrap_rigs(result, RESAMPLES, seed, lambda: progress.advance(task)))
     typer.echo(describe_board_calibration(result))
     write_board_calibration(out, result)
     if picture is not None:
