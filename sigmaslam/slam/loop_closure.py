@@ -75,7 +75,7 @@ class LoopCloser:
         if keyframe is None:
             return None
         self.looked = newest.timestamp
-        relative = self.matcher.relative_pose_to(keyframe.view, newest.view)
+        relative = self.matcher.confirmed_pose_to(keyframe.view, newest.view)
         if relative is None:
             return None
         index, relative = self.keyframes.index(keyframe.origin), from_origin(keyframe, relative)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -140,10 +140,9 @@ def _find(one: MapFile, other: MapFile) -> Found:
         for each in other.known:
             view = each.view
             for candidate in retrieve(view, _CANDIDATES, one.known, appearance):
-                relative = matcher.relative_pose_to(candidate.view, view)
+                relative = matcher.confirmed_pose_to(candidate.view, view)
                 if relative is not None and matcher.is_beyond_chance(relative):
-                    shared = replace(relative, covariance=max(relative.clustering, 1.0) * relative.covariance)
-                    at = from_origin(candidate, shared)
+                    at = from_origin(candidate, relative)
                     spread = turn_covariance(at.T_key_camera, at.covariance)
                     links.append((each, Link(candidate.origin, at.T_key_camera, spread, int(at.inliers.sum()))))
                     break

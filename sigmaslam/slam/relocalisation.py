@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -72,7 +72,7 @@ class Relocaliser:
         # Features of the last one may be many where none of its landmarks is found again.
         last = keyframes.active[-1:] if after_gap else []
         for keyframe in [*last, *retrieve(view, _RETRIEVED, keyframes.left_long_ago(), keyframes.appearance)]:
-            relative, is_last = self.matcher.relative_pose_to(keyframe.view, view), keyframe in last
+            relative, is_last = self.matcher.confirmed_pose_to(keyframe.view, view), keyframe in last
             if relative is None:
                 continue
             pose = nearest_rigid(keyframes.poses([keyframe])[0] @ relative.T_key_camera)
@@ -89,7 +89,6 @@ class Relocaliser:
                 continue
             while keyframes.active:
                 keyframes.marginalise_oldest(spare=keyframe)
-            shared = replace(relative, covariance=max(relative.clustering, 1.0) * relative.covariance)
-            covariance = from_origin(keyframe, shared).covariance
+            covariance = from_origin(keyframe, relative).covariance
             return Relocalisation(admitted, pose, covariance, keyframes.index(keyframe.origin))
         return None

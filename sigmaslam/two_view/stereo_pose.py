@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
+from sigmaslam.estimation.calibration_errors import measured_errors
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.clustered_errors import clustering
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend.patch_kernels import compiled
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rigid_motion, se3_exp, se3_inverse, skew
@@ -23,12 +25,12 @@ _CLEAR, _AS_CLAIMED = 0.8, 0.25
 _MIN_SCALE = 1.0 / 16.0
 MIN_POINTS = 8
 """Fewer agree with a pose by chance: three fix it."""
+MIN_DISPARITY = 1.0
+"""A smaller disparity gives no scale, pixels."""
 # Gauss-Newton takes so many steps. The scale of its robust loss, standard deviations, shrinks by a factor each step.
 _STEPS, _FIRST_SCALE, _NARROWING, _LAST_SCALE = 10, 8.0, 0.75, 2.0
 # Beyond this condition number float64 inverts noise: the points leave something free.
 _MAX_CONDITION = 1e14
-# A smaller disparity gives no scale, pixels.
-_MIN_DISPARITY = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,7 @@ class RelativePose:
         covariance: (6, 6) of x in T_key_camera exp(x), x = (translation, rotation), from the inliers' noise.
         scale: 1 or less, ratio of the actual to the claimed variances of most points.
         clustering: factor by which `covariance` is too small for errors that neighbours share; not applied to it.
+        by_calibration: (6, 15) by how much each error of the calibration, of size one, moves x; not in `covariance`.
     """
 
     T_key_camera: np.ndarray
@@ -48,6 +51,12 @@ class RelativePose:
     covariance: np.ndarray
     scale: float
     clustering: float = 1.0
+    by_calibration: np.ndarray = field(default_factory=lambda: np.zeros((6, CALIBRATION_SIZE)))
+
+    def with_shared_errors(self, calibration: np.ndarray) -> RelativePose:
+        """The same whose covariance has what neighbours share, and the calibration's errors of covariance (15, 15)."""
+        shared = self.by_calibration @ calibration @ self.by_calibration.T
+        return replace(self, covariance=max(self.clustering, 1.0) * self.covariance + shared)
 
 
 def estimate_relative_pose(
@@ -76,7 +85,7 @@ def estimate_relative_pose(
     Returns:
         The pose; None when fewer than eight points agree with either candidate.
     """
-    near = landmarks[:, 2] >= _MIN_DISPARITY
+    near = landmarks[:, 2] >= MIN_DISPARITY
     if near.sum() < MIN_POINTS:
         return None
     points = camera.triangulate(np.where(near[:, None], landmarks, [0.0, 0.0, 1.0]))
@@ -91,6 +100,20 @@ def estimate_relative_pose(
     second, _ = _from_points(camera, near_points, near_pixels, _THRESHOLDS[1])
     given = points, near, landmarks[:, :2], measurement[:, :2], probability, noise[:, :2, :2]
     return _best(matches, [_from_essential(camera, *given), first, second])
+
+
+def foresee(
+    camera: RectifiedStereo, landmarks: np.ndarray, landmark_sigma: np.ndarray, relative: RelativePose
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where a pose sees landmarks of the keyframe; the first arguments as of `estimate_relative_pose`.
+
+    Returns:
+        (M, 3) (u, v, disparity) there, their covariances (M, 3, 3), and whether (M,) each is inside the image.
+    """
+    predicted, front, by_pose, by_landmark = _project(camera, landmarks, se3_inverse(relative.T_key_camera))
+    covariance = by_pose @ relative.covariance @ by_pose.transpose(0, 2, 1) + _spread(by_landmark, landmark_sigma)
+    u, v = predicted[:, 0], predicted[:, 1]
+    return predicted, covariance, front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
 
 
 def _best(matches: _StereoMatches, candidates: list[np.ndarray | None]) -> RelativePose | None:
@@ -166,38 +189,19 @@ class _StereoMatches:
     noise: np.ndarray
     weight: np.ndarray
 
+    def errors_of_calibration(self, T_camera_key: np.ndarray) -> np.ndarray:
+        """(M, 3, 15) by how much each error, of size one, changes the residuals of `linearise`."""
+        _, _, _, by_landmark = _project(self.camera, self.landmarks, T_camera_key)
+        here, there = (measured_errors(self.camera, uvd) for uvd in (self.measurement, self.landmarks))
+        return here - by_landmark @ there
+
     def linearise(self, T_camera_key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residual (M, 3), its derivative by a perturbation of T from the left (M, 3, 6), and information (M, 3, 3).
 
         Unknown components, and points behind the camera, have zero information.
         """
-        camera = self.camera
-        focal = camera.focal_baseline
-        # Points are scaled by inverse depth, so that points at infinity are regular.
-        rays = camera.rays(self.landmarks[:, :2])
-        inverse_depth = self.landmarks[:, 2] / focal
-        R, t = T_camera_key[:3, :3], T_camera_key[:3, 3]
-        seen = rays @ R.T + inverse_depth[:, None] * t
-        front = seen[:, 2] > 1e-6
-        x, y, z = np.where(front[:, None], seen, [0.0, 0.0, 1.0]).T
-        predicted = np.column_stack(
-            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, focal * inverse_depth / z]
-        )
-        by_seen = np.zeros((len(z), 3, 3))
-        by_seen[:, 0, 0], by_seen[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
-        by_seen[:, 1, 1], by_seen[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
-        by_seen[:, 2, 2] = -focal * inverse_depth / z**2
-        by_pose = np.concatenate([by_seen * inverse_depth[:, None, None], -by_seen @ skew(seen)], axis=2)
-        by_landmark = by_seen @ np.stack(
-            [
-                np.tile(R[:, 0] / camera.fx, (len(z), 1)),
-                np.tile(R[:, 1] / camera.fy, (len(z), 1)),
-                np.tile(t / focal, (len(z), 1)),
-            ],
-            axis=2,
-        )
-        by_landmark[:, 2, 2] += 1.0 / z
-        spread = self.noise + (by_landmark * (self.landmark_sigma**2)[:, None, :]) @ by_landmark.transpose(0, 2, 1)
+        predicted, front, by_pose, by_landmark = _project(self.camera, self.landmarks, T_camera_key)
+        spread = self.noise + _spread(by_landmark, self.landmark_sigma)
         residual = self.measurement - predicted
         measured = np.isfinite(residual) & front[:, None]
         present = measured[:, :, None] & measured[:, None, :]
@@ -226,6 +230,46 @@ class _StereoMatches:
         weighted = by_pose.transpose(0, 2, 1) @ (information * weight[:, None, None])
         squared = np.where(np.trace(information, axis1=1, axis2=2) > 0, squared, np.inf)
         return squared, (weighted @ by_pose).sum(axis=0), np.einsum("mij,mj->i", weighted, residual)
+
+
+def _project(
+    camera: RectifiedStereo, landmarks: np.ndarray, T_camera_key: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where landmarks (M, 3) of a keyframe are seen, (M, 3), and whether in front of the camera (M,).
+
+    And the derivatives by a perturbation of T from the left (M, 3, 6) and by the landmark (M, 3, 3).
+    """
+    focal = camera.focal_baseline
+    # Points are scaled by inverse depth, so that points at infinity are regular.
+    rays = camera.rays(landmarks[:, :2])
+    inverse_depth = landmarks[:, 2] / focal
+    R, t = T_camera_key[:3, :3], T_camera_key[:3, 3]
+    seen = rays @ R.T + inverse_depth[:, None] * t
+    front = seen[:, 2] > 1e-6
+    x, y, z = np.where(front[:, None], seen, [0.0, 0.0, 1.0]).T
+    predicted = np.column_stack(
+        [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, focal * inverse_depth / z]
+    )
+    by_seen = np.zeros((len(z), 3, 3))
+    by_seen[:, 0, 0], by_seen[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    by_seen[:, 1, 1], by_seen[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    by_seen[:, 2, 2] = -focal * inverse_depth / z**2
+    by_pose = np.concatenate([by_seen * inverse_depth[:, None, None], -by_seen @ skew(seen)], axis=2)
+    by_landmark = by_seen @ np.stack(
+        [
+            np.tile(R[:, 0] / camera.fx, (len(z), 1)),
+            np.tile(R[:, 1] / camera.fy, (len(z), 1)),
+            np.tile(t / focal, (len(z), 1)),
+        ],
+        axis=2,
+    )
+    by_landmark[:, 2, 2] += 1.0 / z
+    return predicted, front, by_pose, by_landmark
+
+
+def _spread(by: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Covariance (M, 3, 3) by derivatives (M, 3, 3) of what has standard deviations (M, 3)."""
+    return (by * (sigma**2)[:, None, :]) @ by.transpose(0, 2, 1)
 
 
 def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: float) -> np.ndarray | None:
@@ -266,4 +310,9 @@ def _pose_with_inliers(
         return None
     size = matches.camera.width, matches.camera.height
     shared = clustering(matches.landmarks[inliers, :2], size, (weighted @ residual[..., None])[..., 0], normal)
-    return RelativePose(se3_inverse(T_camera_key), inliers, np.linalg.inv(normal), scale, shared)
+    # Of a place alone nothing is asked of its disparity.
+    by_error = np.nan_to_num(matches.errors_of_calibration(T_camera_key)[inliers])
+    covariance = np.linalg.inv(normal)
+    # From the left in T_camera_key it is the opposite of what it is from the right in its inverse.
+    by_calibration = covariance @ (weighted @ by_error).sum(axis=0)
+    return RelativePose(se3_inverse(T_camera_key), inliers, covariance, scale, shared, by_calibration)

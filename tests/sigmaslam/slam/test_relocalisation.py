@@ -435,7 +435,7 @@ def relocaliser_where(seen: Iterable[int], x: float, inliers: int, is_measured: 
         view for number, view in enumerate((keyframes.remembered[0].view, keyframes.active[0].view)) if number in seen
     ]
     matcher = SimpleNamespace(
-        relative_pose_to=lambda key, view: relative if any(key is each for each in known) else None,
+        confirmed_pose_to=lambda key, view: relative if any(key is each for each in known) else None,
         is_beyond_chance=lambda found: inliers > 45,
     )
     return Relocaliser(window, keyframes, motion, matcher, AdmitAll(10, 12.0), 15)
