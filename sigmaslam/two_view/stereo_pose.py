@@ -313,6 +313,6 @@ def _pose_with_inliers(
     # Of a place alone nothing is asked of its disparity.
     by_error = np.nan_to_num(matches.errors_of_calibration(T_camera_key)[inliers])
     covariance = np.linalg.inv(normal)
-    # From the left in T_camera_key it is the opposite of what it is from the right in its inverse.
-    by_calibration = covariance @ (weighted @ by_error).sum(axis=0)
+    # A perturbation of T_camera_key from the left is the opposite of one of its inverse from the right.
+    by_calibration = -covariance @ (weighted @ by_error).sum(axis=0)
     return RelativePose(se3_inverse(T_camera_key), inliers, covariance, scale, shared, by_calibration)

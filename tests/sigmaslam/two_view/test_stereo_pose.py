@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.calibration_errors import ERRORS, measured_errors
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import patch_kernels
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import CELLS, image_cells
@@ -197,6 +199,23 @@ def test_clustering_says_by_how_much_errors_that_neighbours_share_exceed_the_cov
         factors.append(found.clustering)
     assert 0.5 * np.mean(squared) < np.mean(factors) < 2.0 * np.mean(squared), (np.mean(squared), np.mean(factors))
     assert (np.mean(factors) > 2.0) == (shared > 0.0)
+
+
+@pytest.mark.parametrize("name", ["offset", "focal", "yaw", "baseline"])
+def test_an_error_of_the_calibration_moves_the_pose_as_it_says(name):
+    """Both views have it, and the pose of what they then seem to measure departs by it, to first order."""
+    landmarks, truth = points_in_view(200), se3_exp(MOTIONS["general"])
+    seen = observe(landmarks, truth)
+    error = np.zeros(CALIBRATION_SIZE)
+    error[ERRORS.index(name)] = 1e-4 if name in ("focal", "baseline") else 0.01
+    moved = (uvd + measured_errors(CAMERA, uvd) @ error for uvd in (landmarks, seen))
+    right, found = estimate(landmarks, seen), estimate(*moved)
+    assert right is not None
+    assert found is not None
+    expected = right.by_calibration @ error
+    assert np.linalg.norm(expected) > 0.0
+    departure = se3_log(se3_inverse(right.T_key_camera) @ found.T_key_camera)
+    np.testing.assert_allclose(departure, expected, atol=0.02 * np.linalg.norm(expected))
 
 
 def test_compiled_equations_equal_their_twin(monkeypatch):
