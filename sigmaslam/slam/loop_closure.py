@@ -34,15 +34,18 @@ _STANDS_OUT = 5.0
 
 @dataclass(frozen=True, slots=True)
 class _Contradiction:
-    """A loop that the covariance excludes: by what the pose should move (6,), and the covariance of that."""
+    """A loop that the covariance excludes: by what a pose (4, 4) should move (6,), and the covariance of that."""
 
+    pose: np.ndarray
     difference: np.ndarray
     covariance: np.ndarray
 
-    def agrees_with(self, other: _Contradiction) -> bool:
-        """Whether both say the same (99.99 %)."""
-        apart = self.difference - other.difference
-        squared = apart @ np.linalg.lstsq(self.covariance + other.covariance, apart, rcond=1e-12)[0]
+    def agrees_with(self, earlier: _Contradiction, depth: float) -> bool:
+        """Whether both say the same (99.99 %), if odometry has been off since by as much as it may be."""
+        apart = self.difference - earlier.difference
+        since = _DRIFT * np.linalg.norm(self.pose[:3, 3] - earlier.pose[:3, 3])
+        drift = turn_covariance(self.pose, np.diag(np.repeat([since, since / depth], 3) ** 2))
+        squared = apart @ np.linalg.lstsq(self.covariance + earlier.covariance + drift, apart, rcond=1e-12)[0]
         return bool(squared < CHI_SQUARE_9999_OF_6)
 
 
@@ -81,9 +84,9 @@ class LoopCloser:
         index, relative = self.keyframes.index(keyframe.origin), from_origin(keyframe, relative)
         pose, measured = state.past.poses[index], relative.T_key_camera
         covariance = turn_covariance(pose @ measured, relative.covariance)
-        loop = _Contradiction(loop_difference(state, index, measured), covariance)
+        loop = _Contradiction(state.poses[-1], loop_difference(state, index, measured), covariance)
         departure = np.linalg.norm((se3_inverse(pose) @ state.poses[-1] - measured)[:3, 3])
-        confirmed = self.refused is not None and loop.agrees_with(self.refused)
+        confirmed = self.refused is not None and loop.agrees_with(self.refused, self.window.depth)
         confirmed = confirmed and bool(departure < drift) and self.matcher.is_beyond_chance(relative)
         used = self.window.add_loop_constraint(index, measured, covariance, confirmed)
         self.refused = None if used else loop
