@@ -24,6 +24,7 @@ class Acceptance:
         probable_share: of the matches that should be right by their probabilities; symmetric texture gives less.
         improbable_inliers: times the least inliers below that share, and where the motion excludes the pose.
         confirmed_share: of a keyframe's landmarks that look alike from a pose; from a wrong one hardly any is there.
+        clear_share: of all landmarks that a pose foresees, however they look; more is believed against the motion.
         rival_area: share of the image that the greater motion explains; a lesser one is a wrong lens or chance.
         scene_farther: ratio of median disparities; of two rivals the scene lies behind what moves.
         same_motion: pixels between what two poses see, in the median; nearer ones say the same.
@@ -69,6 +70,7 @@ class Acceptance:
     probable_share: float = 0.5
     improbable_inliers: int = 3
     confirmed_share: float = 0.3
+    clear_share: float = 0.25
     rival_area: float = 1 / 3
     scene_farther: float = 1.25
     same_motion: float = 2.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -91,7 +91,8 @@ class UnguidedMatcher:
             return None
         alike = inside & _look_alike(self.camera, measured, found.T_key_camera)
         least = max(ACCEPTANCE.confirmed_share * alike.sum(), self.config.min_inliers)
-        return found.with_shared_errors(errors) if found.inliers.sum() >= least else None
+        found = replace(found.with_shared_errors(errors), foreseen=int(inside.sum()))
+        return found if found.inliers.sum() >= least else None
 
     def _pose_of(
         self, key: StereoView, matches: TemporalMatches, excludes: Callable[[np.ndarray], bool] | None = None
@@ -114,7 +115,8 @@ class UnguidedMatcher:
 
     def is_beyond_chance(self, relative: RelativePose) -> bool:
         """Whether so many agree as no repeated texture does, wherever the pose lies."""
-        return bool(relative.inliers.sum() >= ACCEPTANCE.improbable_inliers * self.config.min_inliers)
+        least = max(ACCEPTANCE.improbable_inliers * self.config.min_inliers, ACCEPTANCE.clear_share * relative.foreseen)
+        return bool(relative.inliers.sum() >= least)
 
 
 def _look_alike(camera: RectifiedStereo, measured: np.ndarray, T_key_camera: np.ndarray) -> np.ndarray:

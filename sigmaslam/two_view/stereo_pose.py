@@ -43,6 +43,7 @@ class RelativePose:
         covariance: (6, 6) of x in T_key_camera exp(x), x = (translation, rotation), from the inliers' noise.
         scale: 1 or less, ratio of the actual to the claimed variances of most points.
         clustering: factor by which `covariance` is too small for errors that neighbours share; not applied to it.
+        foreseen: number of landmarks that the pose sees, if they were searched for.
         by_calibration: (6, 15) by how much each error of the calibration, of size one, moves x; not in `covariance`.
     """
 
@@ -51,6 +52,7 @@ class RelativePose:
     covariance: np.ndarray
     scale: float
     clustering: float = 1.0
+    foreseen: int = 0
     by_calibration: np.ndarray = field(default_factory=lambda: np.zeros((6, CALIBRATION_SIZE)))
 
     def with_shared_errors(self, calibration: np.ndarray) -> RelativePose:
@@ -315,4 +317,4 @@ def _pose_with_inliers(
     covariance = np.linalg.inv(normal)
     # A perturbation of T_camera_key from the left is the opposite of one of its inverse from the right.
     by_calibration = -covariance @ (weighted @ by_error).sum(axis=0)
-    return RelativePose(se3_inverse(T_camera_key), inliers, covariance, scale, shared, by_calibration)
+    return RelativePose(se3_inverse(T_camera_key), inliers, covariance, scale, shared, by_calibration=by_calibration)

@@ -13,6 +13,7 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
+from sigmaslam.two_view.stereo_pose import RelativePose
 
 CAMERA = RectifiedStereo(fx=400.0, fy=400.0, cx=319.5, cy=239.5, baseline=0.2, width=640, height=480)
 IMAGE = np.zeros((480, 640), np.uint8)
@@ -99,3 +100,14 @@ def test_few_landmarks_suffice_where_none_can_look_alike():
     key, pose = key_view(2, 6.0), se3_exp(np.array([0.0, 0.0, 1.6, 0.0, 0.0, 0.0]))
     agreeing = some(80)
     assert matcher_of(Sights(key, pose, agreeing, agreeing)).confirmed_pose_to(key, key) is not None
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "foreseen", "is_clear"), [(44, 60, False), (60, 0, True), (60, 200, True), (60, 300, False)]
+)
+def test_what_motion_excludes_is_believed_by_many_and_a_share_of_all_foreseen(
+    agreeing: int, foreseen: int, is_clear: bool
+):
+    relative = RelativePose(np.eye(4), np.arange(400) < agreeing, np.eye(6), 1.0, foreseen=foreseen)
+    matcher = matcher_of(Sights(key_view(0), np.eye(4), some(60), some(60)))
+    assert matcher.is_beyond_chance(relative) == is_clear
