@@ -195,6 +195,13 @@ def track(
             help="Show the run in a window of Rerun while it goes on, or write what it would show (extra 'viewer').",
         ),
     ] = None,
+    serve: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Show the run on a web page, read-only: of this machine alone, unless a HOST is given.",
+        ),
+    ] = None,
     dense: Annotated[
         Path | None,
         typer.Option(metavar="FILE.ply", help="Also make the cloud of `map reconstruct` while the run goes on."),

@@ -1,8 +1,9 @@
-"""What `track` gives its frames to beside the run folder: a stream, a video, a viewer."""
+"""What `track` gives its frames to beside the run folder: a stream, a video, a viewer, a web page."""
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
     from sigmaslam.geometry.camera import StereoCamera
     from sigmaslam.live.frame_sink import FrameSink
     from sigmaslam.live.rerun_viewer import RerunSink
+    from sigmaslam.live.web_page import WebPageSink
     from sigmaslam.runs.request import LiveOptions
+    from sigmaslam.slam.estimate import CalibrationEstimate
 
 UNREAD = 1
 """Exit code where nobody reads the output any more."""
@@ -32,7 +35,7 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
     """The sinks that the command line names; with a stream on the standard output all else goes to the standard error.
 
     Args:
-        options: stream, video, viewer and dense cloud.
+        options: stream, video, viewer, web page and dense cloud.
         out: folder of the run.
         camera: of its images.
     Raises:
@@ -51,6 +54,8 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
     if viewer is not None:
         # It is closed after the cloud, which it shows.
         sinks.append(ThreadedSink(viewer))
+    if options.serve is not None:
+        sinks.append(ThreadedSink(_open_page(options.serve, camera)))
     if options.stream is None:
         yield sinks
         return
@@ -94,6 +99,22 @@ def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
     if path is not None:
         check_sink_path("--viewer", path, out, RERUN_NAME)
     return RerunSink(path, camera)
+
+
+def _open_page(address: str, camera: StereoCamera) -> WebPageSink:
+    from sigmaslam.live.web_page import WebPageSink
+    from sigmaslam.run_record.frame_table import TRACKED
+    from sigmaslam.run_record.run_folder import describe_camera
+    from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
+
+    expected = expected_offset(describe_camera(camera))
+
+    def judge(calibration: CalibrationEstimate, statuses: Counter[str], points: int) -> str:
+        return calibration_verdict(calibration, sum(statuses[each] for each in TRACKED), points, expected)
+
+    page = WebPageSink(address, camera, judge)
+    typer.echo(f"Watch the run at {page.url}", err=True)
+    return page
 
 
 def _open_cloud(

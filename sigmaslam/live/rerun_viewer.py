@@ -113,7 +113,8 @@ class RerunSink:
     def _show_image(self, seen: MatchedFrame) -> None:
         _, encoded = cv2.imencode(".jpg", seen.left, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         self._recording.log(IMAGE, rr.EncodedImage(contents=encoded.tobytes(), media_type="image/jpeg"))
-        rows, trails = self._trails.add(seen)
+        self._trails.add(seen)
+        rows, trails = self._trails.follow()
         colours = shade_matches(seen.matches.probability[rows])[:, ::-1]
         # Rerun has the origin in the corner of the first pixel, we in its centre.
         self._recording.log(f"{IMAGE}/trails", rr.LineStrips2D([trail + 0.5 for trail in trails], colors=colours))
