@@ -191,8 +191,9 @@ def track(
     viewer: Annotated[
         str | None,
         typer.Option(
-            metavar="rerun[:FILE.rrd]",
-            help="Show the run in a window of Rerun while it goes on, or write what it would show (extra 'viewer').",
+            metavar="rerun[:FILE.rrd]|URL",
+            help="Show the run in Rerun while it goes on, here or in an open viewer at URL, or write what it would "
+            "show (extra 'viewer').",
         ),
     ] = None,
     serve: Annotated[

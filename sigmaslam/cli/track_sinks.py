@@ -90,11 +90,15 @@ def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
     from sigmaslam.run_record.run_folder import RERUN_NAME
 
     name, colon, file = viewer.partition(":")
-    if name != "rerun" or (colon and not file):
-        raise InputError(f"--viewer {viewer}: is no viewer; give rerun for a window, or rerun:FILE.rrd")
+    is_url = name in ("rerun+http", "rerun+https") and file.startswith("//")
+    if not is_url and (name != "rerun" or (colon and not file)):
+        mend = "give rerun for a window, rerun:FILE.rrd, or an open viewer's rerun+http://HOST:9876/proxy"
+        raise InputError(f"--viewer {viewer}: is no viewer; {mend}")
     need_extra("viewer")
     from sigmaslam.live.rerun_viewer import RerunSink
 
+    if is_url:
+        return RerunSink(viewer, camera)
     path = Path(file) if file else None
     if path is not None:
         check_sink_path("--viewer", path, out, RERUN_NAME)
