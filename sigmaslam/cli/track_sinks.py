@@ -9,20 +9,24 @@ from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import typer
 
 from sigmaslam.cli.extras import need_extra
 from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.live.estimate_stream import PipeStream, open_stream
+from sigmaslam.live.frame_sink import FrameSink, ThreadedSink, check_sink_path
+from sigmaslam.live.video import VideoSink
+from sigmaslam.live.web_page import WebPageSink
+from sigmaslam.run_record.frame_table import TRACKED
+from sigmaslam.run_record.run_folder import RERUN_NAME, VIDEO_NAME, describe_camera
+from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
+from sigmaslam.runs.request import LiveOptions
+from sigmaslam.slam.estimate import CalibrationEstimate
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from sigmaslam.geometry.camera import StereoCamera
-    from sigmaslam.live.frame_sink import FrameSink
     from sigmaslam.live.rerun_viewer import RerunSink
-    from sigmaslam.live.web_page import WebPageSink
-    from sigmaslam.runs.request import LiveOptions
-    from sigmaslam.slam.estimate import CalibrationEstimate
 
 UNREAD = 1
 """Exit code where nobody reads the output any more."""
@@ -42,9 +46,6 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
         InputError: a name is wrong.
         typer.Exit: the run is whole, but nobody reads the stream any more.
     """
-    from sigmaslam.live.estimate_stream import PipeStream, open_stream
-    from sigmaslam.live.frame_sink import ThreadedSink
-
     sinks: list[FrameSink] = []
     if options.video is not None:
         sinks.append(_open_video(options.video, out, camera))
@@ -77,18 +78,11 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
 
 
 def _open_video(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
-    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
-    from sigmaslam.live.video import VideoSink
-    from sigmaslam.run_record.run_folder import VIDEO_NAME
-
     check_sink_path("--video", path, out, VIDEO_NAME)
     return ThreadedSink(VideoSink(path, camera))
 
 
 def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
-    from sigmaslam.live.frame_sink import check_sink_path
-    from sigmaslam.run_record.run_folder import RERUN_NAME
-
     name, colon, file = viewer.partition(":")
     is_url = name in ("rerun+http", "rerun+https") and file.startswith("//")
     if not is_url and (name != "rerun" or (colon and not file)):
@@ -106,11 +100,6 @@ def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
 
 
 def _open_page(address: str, camera: StereoCamera) -> WebPageSink:
-    from sigmaslam.live.web_page import WebPageSink
-    from sigmaslam.run_record.frame_table import TRACKED
-    from sigmaslam.run_record.run_folder import describe_camera
-    from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
-
     expected = expected_offset(describe_camera(camera))
 
     def judge(calibration: CalibrationEstimate, statuses: Counter[str], points: int) -> str:
@@ -124,7 +113,6 @@ def _open_page(address: str, camera: StereoCamera) -> WebPageSink:
 def _open_cloud(
     path: Path, out: Path, camera: StereoCamera, show: Callable[[np.ndarray, np.ndarray], None] | None
 ) -> FrameSink:
-    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
     from sigmaslam.reconstruction.live_cloud import CloudSink
     from sigmaslam.run_record.dense_points import CLOUD_NAME
 

@@ -45,24 +45,22 @@ class FramePainter:
 
     Args:
         camera: of the raw images.
+
+    Attributes:
+        plan: what is drawn beside the image.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
         self._trails = MatchTrails()
-        self._plan = _Plan(KeyframePoints(camera))
+        self.plan = Plan(KeyframePoints(camera))
         self._newest: tuple[TrackedFrame, MatchedFrame] | None = None
-
-    @property
-    def points(self) -> int:
-        """How many points the plan holds."""
-        return self._plan.count
 
     def add(self, frame: TrackedFrame) -> None:
         """Takes a frame, which costs little."""
         assert frame.seen is not None
         self._newest = frame, frame.seen
         self._trails.add(frame.seen)
-        self._plan.add(frame)
+        self.plan.add(frame)
 
     def draw(self) -> np.ndarray:
         """(H, W, 3) uint8 in OpenCV's order of colours, of the same even size for every frame of a run.
@@ -75,9 +73,9 @@ class FramePainter:
         scale = min(_HEIGHT / height, _MAX_WIDTH / width)
         size = 2 * round(0.5 * scale * width), 2 * round(0.5 * scale * height)
         image = _draw_matches(seen, self._trails, size)
-        words = self._plan.describe(frame)
+        words = self.plan.describe(frame)
         panel = np.full((size[1], size[1], 3), _BACKGROUND, np.uint8)
-        self._plan.draw(panel[: size[1] - _LINES * _LINE - 8])
+        self.plan.draw(panel[: size[1] - _LINES * _LINE - 8])
         for k, (text, colour) in enumerate(words):
             _write(panel, text, (12, size[1] - _LINES * _LINE + k * _LINE + 8), colour)
         return np.hstack([image, panel])
@@ -132,8 +130,12 @@ def _draw_matches(frame: MatchedFrame, trails: MatchTrails, size: tuple[int, int
     return np.asarray(picture)
 
 
-class _Plan:
-    """The path and the points of keyframes, seen along the y axis of the first camera, which points down."""
+class Plan:
+    """The path and the points of keyframes, seen along the y axis of the first camera, which points down.
+
+    Attributes:
+        count: of the points so far.
+    """
 
     def __init__(self, points: KeyframePoints) -> None:
         self._keyframe_points = points
@@ -142,7 +144,7 @@ class _Plan:
         self._path: list[np.ndarray] = []
         self._status: list[str] = []
         self._length = 0.0
-        self._poses, self._step = 0, 1
+        self._poses, self._step, self.count = 0, 1, 0
         self._position: np.ndarray | None = None
         self._covariance = np.zeros((2, 2))
         self._heading = np.array([0.0, 1.0])
@@ -167,17 +169,13 @@ class _Plan:
         self._covariance = (rotation @ result.pose_covariance[:3, :3] @ rotation.T)[np.ix_([0, 2], [0, 2])]
         if not isinstance(result, ObjectEstimate):
             points, grey = self._keyframe_points.add(frame)
+            self.count += len(points)
             self._points.append(points[:: self._step, [0, 2]])
             self._grey.append(grey[:: self._step])
         if len(self._path) == _MOST_POSES:
             self._step *= 2
             del self._path[1::2], self._status[1::2]
             self._points, self._grey = [np.concatenate(self._points)[::2]], [np.concatenate(self._grey)[::2]]
-
-    @property
-    def count(self) -> int:
-        """Of the points."""
-        return sum(map(len, self._points))
 
     def describe(self, frame: TrackedFrame) -> list[tuple[str, Sequence[float]]]:
         """Lines of text and their colours."""

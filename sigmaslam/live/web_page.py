@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import logging
-import socket
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,7 @@ from sigmaslam.live.frame_drawing import FramePainter
 from sigmaslam.live.frame_sink import TrackedFrame
 from sigmaslam.slam.estimate import CalibrationEstimate
 
-_LOGGER = logging.getLogger(__name__)
-_HERE = frozenset({"127.0.0.1", "localhost", "::1"})
+_HERE = frozenset({"127.0.0.1", "localhost"})
 # Seconds between two pictures at least, however many look: drawing takes a core 10 to 20 ms.
 _INTERVAL = 0.2
 _QUALITY = 80
@@ -32,6 +31,8 @@ _QUALITY = 80
 _RATED, _PATIENCE = 20, 10.0
 # Seconds that the end of a run waits for the server at most.
 _POLL = 0.1
+Answer = Callable[[str], tuple[str, bytes] | None]
+"""Type and content of what is at a path; None where nothing is."""
 Judge = Callable[[CalibrationEstimate, Counter[str], int], str]
 """Says a verdict on the calibration, from its estimate, the frames of each status, and the number of points."""
 
@@ -55,14 +56,16 @@ class WebPageSink:
 
     def __init__(self, address: str, camera: StereoCamera, judge: Judge) -> None:
         host, _, port = address.rpartition(":")
-        host = host.strip("[]") or "127.0.0.1"
+        host = host or "127.0.0.1"
         if not port.isascii() or not port.isdigit() or int(port) > 65535:
             raise InputError(f"--serve {address}: is no address; give a PORT as 8000, or HOST:PORT")
         try:
-            self._server = _Server(host, int(port), self._answer)
+            # A page of another site that names itself as this machine must not read the pictures.
+            handler = partial(_Handler, self._answer, _HERE if host in _HERE else None)
+            self._server = ThreadingHTTPServer((host, int(port)), handler)
         except OSError as error:
             raise InputError(f"--serve {address}: {error.strerror}; give another port, or 0 for a free one") from None
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.server_port}/"
+        self.url = f"http://{host}:{self._server.server_port}/"
         self._painter, self._judge = FramePainter(camera), judge
         self._lock = threading.Lock()
         self._frame: TrackedFrame | None = None
@@ -86,7 +89,6 @@ class WebPageSink:
         self._server.server_close()
 
     def _answer(self, path: str) -> tuple[str, bytes] | None:
-        """Type and content of what is at a path; None where nothing is."""
         if path == "/":
             return "text/html; charset=utf-8", Path(__file__).with_name("web_page.html").read_bytes()
         if path not in ("/state.json", "/picture.jpg"):
@@ -106,7 +108,7 @@ class WebPageSink:
             **describe_estimate(self._frame),
             "frames_a_second": (len(self._times) - 1) / elapsed if elapsed > 0.0 else None,
             "statuses": dict(self._statuses),
-            "verdict": self._judge(calibration, self._statuses, self._painter.points),
+            "verdict": self._judge(calibration, self._statuses, self._painter.plan.count),
         }
 
     def _draw(self) -> bytes:
@@ -114,40 +116,28 @@ class WebPageSink:
         now = time.monotonic()
         if now - self._drawn >= _INTERVAL:
             self._drawn = now
-            self._picture = cv2.imencode(".jpg", self._painter.draw(), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[
-                1
-            ].tobytes()
+            _, encoded = cv2.imencode(".jpg", self._painter.draw(), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            self._picture = encoded.tobytes()
         return self._picture
-
-
-class _Server(ThreadingHTTPServer):
-    """Answers GET of what `answer` knows, each request in a thread; refuses all else."""
-
-    def __init__(self, host: str, port: int, answer: Callable[[str], tuple[str, bytes] | None]) -> None:
-        self.address_family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        self.answer = answer
-        # A page of another site that names itself as this machine must not read the pictures.
-        self.hosts = _HERE if host in _HERE else None
-        super().__init__((host, port), _Handler)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that has gone stops nothing."""
-        _LOGGER.debug("--serve: an answer to %s failed", client_address, exc_info=True)
 
 
 class _Handler(BaseHTTPRequestHandler):
     timeout = _PATIENCE
     server_version, sys_version = "SigmaSLAM", ""
 
+    def __init__(self, answer: Answer, hosts: frozenset[str] | None, *request: Any) -> None:
+        self._answer, self._hosts = answer, hosts
+        with suppress(OSError, ValueError):  # a client that has gone, or talks nonsense
+            super().__init__(*request)
+
     def do_GET(self) -> None:
-        assert isinstance(self.server, _Server)
         host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
-        if self.server.hosts is not None and host not in self.server.hosts:
+        if self._hosts is not None and host not in self._hosts:
             self.send_error(403)
-        elif (answer := self.server.answer(urlsplit(self.path).path)) is None:
+        elif (found := self._answer(urlsplit(self.path).path)) is None:
             self.send_error(404)
         else:
-            self._send(200, *answer)
+            self._send(200, *found)
 
     def __getattr__(self, name: str) -> Callable[[], None]:
         """Every method but GET is refused."""

@@ -12,7 +12,7 @@ from sigmaslam.bodies.object_tracker import ObjectEstimate
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.se3 import se3_exp
-from sigmaslam.live.frame_drawing import STATUS_COLOURS, FramePainter, _Plan
+from sigmaslam.live.frame_drawing import STATUS_COLOURS, FramePainter, Plan
 from sigmaslam.live.frame_sink import ThreadedSink, TrackedFrame, check_sink_path
 from sigmaslam.live.keyframe_points import KeyframePoints
 from sigmaslam.live.video import VideoSink, count_frames, frame_rate
@@ -128,7 +128,7 @@ def test_the_plan_of_a_long_run_is_thinned_and_ends_at_the_newest_pose(
     camera: StereoCamera, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("sigmaslam.live.frame_drawing._MOST_POSES", 11)
-    plan = _Plan(KeyframePoints(camera))
+    plan = Plan(KeyframePoints(camera))
     for number in range(100):
         pose = np.eye(4)
         pose[2, 3] = number
