@@ -204,7 +204,9 @@ class Plan:
         path = np.array(self._path)
         points = np.concatenate([np.zeros((0, 2)), *self._points])
         height, width = panel.shape[:2]
-        low, high = _extent(path, points)
+        low, high = extent(path, points, path[-1], 5.0)
+        margin = max(0.1 * float(np.max(high - low)), 1e-3)
+        low, high = low - margin, high + margin
         scale = _MARGIN * min(width / (high[0] - low[0]), height / (high[1] - low[1]))
         # In steps, so that the view does not creep.
         scale = float(2.0 ** (np.floor(_STEPS * np.log2(scale)) / _STEPS))
@@ -243,19 +245,22 @@ class Plan:
             cv2.ellipse(panel, _pair(at), _pair(half[::-1]), angle, 0.0, 360.0, colour, 1, cv2.LINE_AA, _SHIFT)
 
 
-def _extent(path: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,), (2,) of what is shown: the path (P, 2), and the points (N, 2) as far as they are near; metres."""
+def extent(path: np.ndarray, points: np.ndarray, centre: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (D,), (D,) of what a view shows: the path, and the points as far as they are near.
+
+    Args:
+        path: (P, D) metres.
+        points: (N, D); the farthest are the least certain ones.
+        centre: (D,) from which points count as near, as the median one or 0.3 times the size of the path.
+        far: percent of the points on either side that are left out.
+    """
     low, high = path.min(axis=0), path.max(axis=0)
-    size = float(np.max(high - low))
     if len(points):
-        reach = max(0.3 * size, float(np.median(np.linalg.norm(points - path[-1], axis=1))))
-        near_low, near_high = np.percentile(points, (5, 95), axis=0)
-        low, high = (
-            np.minimum(low, np.maximum(near_low, low - reach)),
-            np.maximum(high, np.minimum(near_high, high + reach)),
-        )
-    least = max(0.1 * float(np.max(high - low)), 1e-3)
-    return low - least, high + least
+        reach = max(0.3 * float(np.max(high - low)), float(np.median(np.linalg.norm(points - centre, axis=1))))
+        near_low, near_high = np.percentile(points, (far, 100.0 - far), axis=0)
+        low = np.minimum(low, np.maximum(near_low, low - reach))
+        high = np.maximum(high, np.minimum(near_high, high + reach))
+    return low, high
 
 
 def format_length(metres: float) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sigmaslam import source_commit
+from sigmaslam_training import source_commit
 
 SOURCE = Path(source_commit.__file__)
 
