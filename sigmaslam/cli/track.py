@@ -191,16 +191,16 @@ def track(
     viewer: Annotated[
         str | None,
         typer.Option(
-            metavar="rerun[:FILE.rrd]|URL",
-            help="Show the run in Rerun while it goes on, here or in an open viewer at URL, or write what it would "
-            "show (extra 'viewer').",
+            metavar="TARGET",
+            help="Show the run in Rerun (extra 'viewer'): rerun for a window, rerun:FILE.rrd to write it, or the URL "
+            "of a viewer, rerun+http://HOST:9876/proxy.",
         ),
     ] = None,
     serve: Annotated[
         str | None,
         typer.Option(
             metavar="[HOST:]PORT",
-            help="Show the run on a web page, read-only: of this machine alone, unless a HOST is given.",
+            help="Show the run on a web page, read-only; for this machine alone without a HOST.",
         ),
     ] = None,
     dense: Annotated[

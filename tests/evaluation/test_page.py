@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from sigmaslam_benchmarks.source_description import describe_source
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page
-from sigmaslam_training.source_commit import describe_source
 
 
 def test_a_page_says_which_command_and_commit_made_it():
