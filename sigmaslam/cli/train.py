@@ -97,6 +97,7 @@ def network(
         raise
     if leads():
         typer.echo(json.dumps(card, indent=2))
+        typer.echo(f"Next: sigmaslam train export {printable(out)} --out graphs, for track --weights graphs", err=True)
 
 
 def scorer(
