@@ -222,7 +222,7 @@ def track(
     own_networks(request.tracker.frontend, weights, request.tracker.backend)
     sequence = request.input.open()
     if not (overwrite or resume):
-        check_new_folder(out)
+        check_new_folder(out, "--out, give --overwrite or --resume")
     with open_sinks(request.live, out, sequence.camera) as sinks:
         findings = _check(sequence, strict, threads)
         if overwrite:

@@ -64,7 +64,9 @@ class WebPageSink:
             handler = partial(_Handler, self._answer, _HERE if host in _HERE else None)
             self._server = ThreadingHTTPServer((host, int(port)), handler)
         except OSError as error:
-            raise InputError(f"--serve {address}: {error.strerror}; give another port, or 0 for a free one") from None
+            raise InputError(
+                f"--serve {address}: {error.strerror}; give another HOST or PORT; port 0 is a free one"
+            ) from None
         self.url = f"http://{host}:{self._server.server_port}/"
         self._painter, self._judge = FramePainter(camera), judge
         self._lock = threading.Lock()

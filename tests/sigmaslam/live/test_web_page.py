@@ -151,7 +151,7 @@ def test_a_port_that_is_taken_is_named_before_anything_is_tracked(demo_sequence:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         done = run_here("track", demo_sequence, "--out", tmp_path / "run", "--serve", str(port))
-    assert_refused(done, f"--serve {port}", "another port")
+    assert_refused(done, f"--serve {port}", "another HOST or PORT")
     assert not (tmp_path / "run").exists()
 
 
