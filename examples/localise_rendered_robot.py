@@ -192,6 +192,8 @@ def scored(beliefs: list[Gaussian], truth: np.ndarray) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     for name in sys.argv[1:]:
         scores = localise(Path(name))
         print(name, ", ".join(f"{label} {value:.3g}" for label, value in scores.items()))

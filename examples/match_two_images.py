@@ -25,6 +25,8 @@ def run(first: Path, second: Path) -> sigmaslam.Matches:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     matches = run(Path(sys.argv[1]), Path(sys.argv[2]))
     sigma = np.sqrt(np.linalg.eigvalsh(matches.covariance)[:, -1])  # along the longer axis of each ellipse, pixels
     print(f"{len(sigma)} matches; expected to be right: {matches.probability.sum():.0f}")

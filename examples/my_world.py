@@ -50,4 +50,6 @@ def run(seed: int = 0) -> np.ndarray:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     cv2.imwrite(sys.argv[1], run())

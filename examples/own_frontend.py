@@ -45,6 +45,8 @@ def run(source: Path) -> list[sigmaslam.Estimate]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     estimates = run(Path(sys.argv[1]))
     tracked = [each for each in estimates if each.status == "tracking"]
     print(

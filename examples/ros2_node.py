@@ -27,19 +27,23 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import geometry_msgs.msg as geometry
 import numpy as np
-import rclpy
-from builtin_interfaces.msg import Time as Stamp
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from message_filters import ApproximateTimeSynchronizer, Subscriber
-from nav_msgs.msg import Odometry
-from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
-from rclpy.time import Time
-from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Header
-from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformListener
+
+try:
+    import geometry_msgs.msg as geometry
+    import rclpy
+    from builtin_interfaces.msg import Time as Stamp
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from message_filters import ApproximateTimeSynchronizer, Subscriber
+    from nav_msgs.msg import Odometry
+    from rclpy.node import Node
+    from rclpy.qos import qos_profile_sensor_data
+    from rclpy.time import Time
+    from sensor_msgs.msg import CameraInfo, Image
+    from std_msgs.msg import Header
+    from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformListener
+except ImportError as error:
+    sys.exit(f"{error.name} is not there: source ROS 2's setup.bash, in a Python that has sigmaslam as well")
 
 from sigmaslam import Estimate, StereoTracker
 from sigmaslam.calibration_files.calibration import read_calibration

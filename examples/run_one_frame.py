@@ -134,6 +134,8 @@ def exponential(twist: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        sys.exit(__doc__)
     given_weights, given_folder, given_index = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     found, covariance_found = run(given_weights, given_folder, given_index)
     truth = np.vstack([np.loadtxt(given_folder / "poses.txt")[given_index].reshape(3, 4), [0, 0, 0, 1]])

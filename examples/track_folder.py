@@ -31,6 +31,8 @@ def three_sigma(estimate: sigmaslam.Estimate) -> tuple[np.ndarray, np.ndarray]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     for estimate in run(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None):
         if not estimate.has_pose:
             print(f"{estimate.timestamp:9.3f} s  {estimate.status}")

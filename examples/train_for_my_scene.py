@@ -39,6 +39,8 @@ def features_of(weights: Path, image: np.ndarray) -> Features:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     weights = run(Path(sys.argv[1]))
     image = cv2.imread(
         str(Path(__file__).parents[1] / "synthetic/sigmaslam_synthetic/demo/image_0/000000.png"), cv2.IMREAD_GRAYSCALE

@@ -33,7 +33,7 @@ NAMES = {"sigmaslam_training", "sigmaslam_training.mixes", "sigmaslam_synthetic"
 # a package beside it.
 FLOORS = (
     ("sigmaslam", "compiled", "errors", "table", "sigmaslam_filters", "sigmaslam_weights"),
-    ("bounded_files", "files", "progress", "plot_style", "source_commit", "filters"),
+    ("bounded_files", "files", "progress", "plot_style", "filters"),
     ("geometry",),
     ("inference", "calibration_files"),
     ("estimation", "image_filtering", "readers"),

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from sigmaslam.cli.extras import RayAddress, need_extra
 from sigmaslam.errors import InputError
-from sigmaslam.source_commit import describe_source
+from sigmaslam_benchmarks.source_description import describe_source
 
 benchmark = typer.Typer(name="benchmark", no_args_is_help=True, help="Run a benchmark and write its page.")
 

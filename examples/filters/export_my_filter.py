@@ -79,5 +79,5 @@ def run(path: Path, steps: int = 60) -> float:
 
 
 if __name__ == "__main__":
-    written = Path(sys.argv[1])
+    written = Path(sys.argv[1] if len(sys.argv) > 1 else "dial.onnx")
     print(f"largest difference from torch {export(written):.1e}; angle off by {run(written):.3f} rad")

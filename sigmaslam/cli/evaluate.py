@@ -1,42 +1,12 @@
 """`sigmaslam evaluate`."""
 
 import json
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from sigmaslam.plot_style import NO_MATPLOTLIB
-
-
-class Frame(StrEnum):
-    """Whose poses a truth has."""
-
-    camera = "camera"
-    body = "body"
-
-
-class Quaternion(StrEnum):
-    """Order of the numbers of a quaternion."""
-
-    xyzw = "xyzw"
-    wxyz = "wxyz"
-
-
-class Kind(StrEnum):
-    """What measured a truth."""
-
-    gps = "gps"
-    mocap = "mocap"
-    exact = "exact"
-
-
-class Unit(StrEnum):
-    """Of lengths."""
-
-    m = "m"
-    mm = "mm"
 
 
 def evaluate(
@@ -45,7 +15,7 @@ def evaluate(
         Path, typer.Option(help="TUM, KITTI (with times.txt beside it) or EuRoC csv, or the recording's folder.")
     ],
     truth_kind: Annotated[
-        Kind | None,
+        Literal["gps", "mocap", "exact"] | None,
         typer.Option(help="What measured the truth: GPS/INS, motion capture, or nothing, as a render's is exact."),
     ] = None,
     truth_sigma_position: Annotated[
@@ -55,11 +25,14 @@ def evaluate(
         float | None, typer.Option(metavar="DEG", min=0.0, help="Of the true rotations about each axis, degrees.")
     ] = None,
     truth_frame: Annotated[
-        Frame, typer.Option(help="Whose poses the truth has: of the camera (z ahead), or of a body with x ahead.")
-    ] = Frame.camera,
+        Literal["camera", "body"],
+        typer.Option(help="Whose poses the truth has: of the camera (z ahead), or of a body with x ahead."),
+    ] = "camera",
     truth_inverse: Annotated[bool, typer.Option("--truth-inverse", help="The truth is T_camera_world.")] = False,
-    truth_quaternion: Annotated[Quaternion, typer.Option(help="Order of a TUM truth's quaternions.")] = Quaternion.xyzw,
-    truth_unit: Annotated[Unit, typer.Option(help="Of the true positions.")] = Unit.m,
+    truth_quaternion: Annotated[
+        Literal["xyzw", "wxyz"], typer.Option(help="Order of a TUM truth's quaternions.")
+    ] = "xyzw",
+    truth_unit: Annotated[Literal["m", "mm"], typer.Option(help="Of the true positions.")] = "m",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png.
@@ -84,8 +57,8 @@ def evaluate(
         truth,
         truth_sigma_position=truth_sigma_position,
         truth_sigma_rotation=truth_sigma_rotation,
-        truth_convention=TruthConvention(truth_frame.value, truth_inverse, truth_quaternion.value, truth_unit.value),
-        truth_kind=None if truth_kind is None else truth_kind.value,
+        truth_convention=TruthConvention(truth_frame, truth_inverse, truth_quaternion, truth_unit),
+        truth_kind=truth_kind,
     )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))
     if evaluation.figure_path is None:

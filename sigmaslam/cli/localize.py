@@ -3,9 +3,8 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -15,26 +14,30 @@ from sigmaslam.cli.extras import need_extra
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, check_new_folder, csv_text, make_folder
 
-RecordingFormat = StrEnum("RecordingFormat", ["auto", "mrclam", "tubes", "csv", "starry"])
-"""Kinds of recordings; auto tells by the files."""
-FilterKind = StrEnum("FilterKind", ["ukf", "ekf", "iterated"])
-"""Filters to localise with."""
-Knowledge = StrEnum("Knowledge", ["known", "unknown"])
+FILTERS = ("ukf", "ekf", "iterated")
+"""To localise with, by name."""
+_Pose = tuple[float, float, float]
+"""In the plane: metres, metres, radians."""
+Knowledge = Literal["known", "unknown"]
 """Whether the places of the landmarks are known, or which of them a sighting is of."""
 
 
 def localize(
     path: Annotated[Path, typer.Argument(help="Folder (MRCLAM or CSV) or .mat file of a recording.")],
     out: Annotated[Path, typer.Option(help="Folder, new or empty.")],
-    format: Annotated[RecordingFormat, typer.Option(help="Kind of recording.")] = RecordingFormat["auto"],
+    format: Annotated[
+        Literal["auto", "mrclam", "tubes", "csv", "starry"], typer.Option(help="Kind of recording; auto: by the files.")
+    ] = "auto",
     robot: Annotated[int | None, typer.Option(help="Number of a robot.", show_default="all, as one batch")] = None,
-    filter: Annotated[FilterKind, typer.Option(help="Unscented, extended or iterated unscented.")] = FilterKind["ukf"],
+    filter: Annotated[
+        Literal["ukf", "ekf", "iterated"], typer.Option(help="Unscented, extended or iterated unscented.")
+    ] = "ukf",
     map: Annotated[
         Knowledge, typer.Option(help="Places of the landmarks: as the recording has them, or to be found on the way.")
-    ] = Knowledge["known"],
+    ] = "known",
     association: Annotated[
         Knowledge, typer.Option(help="Landmark of each sighting: as the recording has it, or to be found.")
-    ] = Knowledge["known"],
+    ] = "known",
     compare: Annotated[
         bool, typer.Option("--compare", help="All filters one after the other, each in a folder of its name.")
     ] = False,
@@ -67,24 +70,24 @@ def localize(
     first_pose = None if start is None else _parse_pose(start)
     if not path.exists():
         raise InputError(f"{path}: is not there: give the folder or the .mat file of a recording")
-    kind = detect_format(path) if format is RecordingFormat.auto else format.value
+    kind = detect_format(path) if format == "auto" else format
     if kind == "starry" and (robot is not None or first_pose is not None or max_range is not None):
         raise InputError("--robot, --start and --max-range are for robots in the plane: leave them out here")
-    if kind == "starry" and Knowledge.unknown in (map, association):
+    if kind == "starry" and "unknown" in (map, association):
         raise InputError("--map unknown and --association unknown are for robots in the plane: leave them out here")
-    if smooth and map is Knowledge.unknown:
+    if smooth and map == "unknown":
         raise InputError("--smooth does not go with --map unknown: leave one of them out")
-    settings = {"source": str(path), "format": kind, "max_range": max_range, "start": start, "map": map.value}
-    settings |= {"association": association.value, "lag": lag if smooth else None}
+    settings = {"source": str(path), "format": kind, "max_range": max_range, "start": start, "map": map}
+    settings |= {"association": association, "lag": lag if smooth else None}
     rows: list[_Row] = []
     with Console(stderr=True).status("reading") as status:
-        for name in [each.value for each in FilterKind] if compare else [filter.value]:
+        for name in FILTERS if compare else [filter]:
             folder, run = out / name if compare else out, {**settings, "filter": name}
             try:
                 if kind == "starry":
                     summaries = _localise_body(path, folder, run, status.update)
                 else:
-                    summaries = _localise_robots(path, folder, kind, robot, first_pose, max_range, run, status.update)
+                    summaries = _localise_robots(path, folder, run, status.update, robot, first_pose)
             except FilterError as error:
                 raise InputError(f"{path}: the filter {name} cannot go on: {error}") from error
             rows += [(name, each, summary) for each, summary in summaries.items()]
@@ -101,24 +104,17 @@ def localize(
 
 
 def _localise_robots(
-    path: Path,
-    out: Path,
-    kind: str,
-    robot: int | None,
-    start: tuple[float, float, float] | None,
-    max_range: float | None,
-    settings: dict[str, Any],
-    tell: Callable[[str], None],
+    path: Path, out: Path, settings: dict[str, Any], tell: Callable[[str], None], robot: int | None, start: _Pose | None
 ) -> dict[str, dict[str, Any]]:
     from sigmaslam_localisation.association import associate
     from sigmaslam_localisation.formats import read_recordings
     from sigmaslam_localisation.output import write_robots
     from sigmaslam_localisation.robots import localise_robots
 
-    mapping, associated = settings["map"] == Knowledge.unknown, settings["association"] == Knowledge.known
-    recordings = read_recordings(path, kind, robot, mapping, associated)
-    if max_range is not None:
-        recordings = [recording.within(max_range) for recording in recordings]
+    mapping, associated = settings["map"] == "unknown", settings["association"] == "known"
+    recordings = read_recordings(path, settings["format"], robot, mapping, associated)
+    if settings["max_range"] is not None:
+        recordings = [recording.within(settings["max_range"]) for recording in recordings]
     begin = time.process_time()
     if not associated:
         recordings = associate(recordings, settings["filter"], start, tell, mapping)
@@ -145,7 +141,7 @@ def _localise_body(
     return {name: {**summary, "cpu_seconds": seconds} for name, summary in summaries.items()}
 
 
-def _parse_pose(text: str) -> tuple[float, float, float]:
+def _parse_pose(text: str) -> _Pose:
     try:
         x, y, heading = (float(part) for part in text.split(","))
         if not math.isfinite(x + y + heading):

@@ -10,7 +10,7 @@ PANELS = {
         "Input": ("calibration", "imu", "odometry", "mask", "frames"),
         "Output": ("out", "overwrite", "resume", "video"),
         "Tracker": ("frontend", "map", "track_object"),
-        "Live": ("camera", "stream", "viewer"),
+        "Live": ("camera", "stream", "viewer", "serve"),
     }
 }
 """Names of the parameters in each panel of a command's help; the rest is for experts."""

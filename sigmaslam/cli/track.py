@@ -191,8 +191,16 @@ def track(
     viewer: Annotated[
         str | None,
         typer.Option(
-            metavar="rerun[:FILE.rrd]",
-            help="Show the run in a window of Rerun while it goes on, or write what it would show (extra 'viewer').",
+            metavar="TARGET",
+            help="Show the run in Rerun (extra 'viewer'): rerun for a window, rerun:FILE.rrd to write it, or the URL "
+            "of a viewer, rerun+http://HOST:9876/proxy.",
+        ),
+    ] = None,
+    serve: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Show the run on a web page, read-only; for this machine alone without a HOST.",
         ),
     ] = None,
     dense: Annotated[
@@ -214,7 +222,7 @@ def track(
     own_networks(request.tracker.frontend, weights, request.tracker.backend)
     sequence = request.input.open()
     if not (overwrite or resume):
-        check_new_folder(out)
+        check_new_folder(out, "--out, give --overwrite or --resume")
     with open_sinks(request.live, out, sequence.camera) as sinks:
         findings = _check(sequence, strict, threads)
         if overwrite:

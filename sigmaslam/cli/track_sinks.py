@@ -1,25 +1,32 @@
-"""What `track` gives its frames to beside the run folder: a stream, a video, a viewer."""
+"""What `track` gives its frames to beside the run folder: a stream, a video, a viewer, a web page."""
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import typer
 
 from sigmaslam.cli.extras import need_extra
 from sigmaslam.errors import InputError
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.live.estimate_stream import PipeStream, open_stream
+from sigmaslam.live.frame_sink import FrameSink, ThreadedSink, check_sink_path
+from sigmaslam.live.video import VideoSink
+from sigmaslam.live.web_page import WebPageSink
+from sigmaslam.run_record.frame_table import TRACKED
+from sigmaslam.run_record.run_folder import RERUN_NAME, VIDEO_NAME, describe_camera
+from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
+from sigmaslam.runs.request import LiveOptions
+from sigmaslam.slam.estimate import CalibrationEstimate
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from sigmaslam.geometry.camera import StereoCamera
-    from sigmaslam.live.frame_sink import FrameSink
     from sigmaslam.live.rerun_viewer import RerunSink
-    from sigmaslam.runs.request import LiveOptions
 
 UNREAD = 1
 """Exit code where nobody reads the output any more."""
@@ -32,16 +39,13 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
     """The sinks that the command line names; with a stream on the standard output all else goes to the standard error.
 
     Args:
-        options: stream, video, viewer and dense cloud.
+        options: stream, video, viewer, web page and dense cloud.
         out: folder of the run.
         camera: of its images.
     Raises:
         InputError: a name is wrong.
         typer.Exit: the run is whole, but nobody reads the stream any more.
     """
-    from sigmaslam.live.estimate_stream import PipeStream, open_stream
-    from sigmaslam.live.frame_sink import ThreadedSink
-
     sinks: list[FrameSink] = []
     if options.video is not None:
         sinks.append(_open_video(options.video, out, camera))
@@ -51,6 +55,8 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
     if viewer is not None:
         # It is closed after the cloud, which it shows.
         sinks.append(ThreadedSink(viewer))
+    if options.serve is not None:
+        sinks.append(ThreadedSink(_open_page(options.serve, camera)))
     if options.stream is None:
         yield sinks
         return
@@ -72,34 +78,41 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
 
 
 def _open_video(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
-    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
-    from sigmaslam.live.video import VideoSink
-    from sigmaslam.run_record.run_folder import VIDEO_NAME
-
     check_sink_path("--video", path, out, VIDEO_NAME)
     return ThreadedSink(VideoSink(path, camera))
 
 
 def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
-    from sigmaslam.live.frame_sink import check_sink_path
-    from sigmaslam.run_record.run_folder import RERUN_NAME
-
     name, colon, file = viewer.partition(":")
-    if name != "rerun" or (colon and not file):
-        raise InputError(f"--viewer {viewer}: is no viewer; give rerun for a window, or rerun:FILE.rrd")
+    is_url = name in ("rerun+http", "rerun+https") and file.startswith("//")
+    if not is_url and (name != "rerun" or (colon and not file)):
+        mend = "give rerun for a window, rerun:FILE.rrd, or an open viewer's rerun+http://HOST:9876/proxy"
+        raise InputError(f"--viewer {viewer}: is no viewer; {mend}")
     need_extra("viewer")
     from sigmaslam.live.rerun_viewer import RerunSink
 
+    if is_url:
+        return RerunSink(viewer, camera)
     path = Path(file) if file else None
     if path is not None:
         check_sink_path("--viewer", path, out, RERUN_NAME)
     return RerunSink(path, camera)
 
 
+def _open_page(address: str, camera: StereoCamera) -> WebPageSink:
+    expected = expected_offset(describe_camera(camera))
+
+    def judge(calibration: CalibrationEstimate, statuses: Counter[str], points: int) -> str:
+        return calibration_verdict(calibration, sum(statuses[each] for each in TRACKED), points, expected)
+
+    page = WebPageSink(address, camera, judge)
+    typer.echo(f"Watch the run at {page.url}", err=True)
+    return page
+
+
 def _open_cloud(
     path: Path, out: Path, camera: StereoCamera, show: Callable[[np.ndarray, np.ndarray], None] | None
 ) -> FrameSink:
-    from sigmaslam.live.frame_sink import ThreadedSink, check_sink_path
     from sigmaslam.reconstruction.live_cloud import CloudSink
     from sigmaslam.run_record.dense_points import CLOUD_NAME
 

@@ -92,20 +92,12 @@ def network(
         card = run_training(out, config, workers, resume, recipe.value, weights, device)
     except TrainingStopped as stop:
         if leads():
-            _tell_stop(out, stop.saved, stop.steps)
+            mend = "the same command with --resume goes on" if stop.saved else "give the same command again"
+            typer.echo(f"Stopped: {stop.saved} of {stop.steps} steps are saved in {printable(out)}; {mend}", err=True)
         raise
     if leads():
         typer.echo(json.dumps(card, indent=2))
-
-
-def _tell_stop(out: Path, saved: int, steps: int) -> None:
-    """What a run that was stopped has left, and how to go on with it."""
-    typer.echo(
-        f"Stopped: {saved} of {steps} steps are saved in {printable(out)}; the same command with --resume goes on"
-        if saved
-        else f"Stopped: none of {steps} steps is saved; give the same command again",
-        err=True,
-    )
+        typer.echo(f"Next: sigmaslam train export {printable(out)} --out graphs, for track --weights graphs", err=True)
 
 
 def scorer(
@@ -162,16 +154,15 @@ def export(
     from sigmaslam_training.matching.scoring import SCORER_NAME
     from sigmaslam_training.run_card import CARD_NAME
 
-    if (run / SCORER_NAME).is_file():
-        if scores is not None:
-            raise InputError(f"--scores is of features, {run} is a run of 'train scorer': leave it out")
-        with Console(stderr=True).status("exporting three graphs"):
+    is_scorer = (run / SCORER_NAME).is_file()
+    if is_scorer and scores is not None:
+        raise InputError(f"--scores is of features, {run} is a run of 'train scorer': leave it out")
+    with Console(stderr=True).status("exporting"):
+        if is_scorer:
             differences = export_scoring(run, out)
-        _tell_differences(differences)
-        return
-    on_real_sets = None if scores is None else read_scores(scores)
-    with Console(stderr=True).status("exporting a graph"):
-        differences = export_run(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
+        else:
+            on_real_sets = None if scores is None else read_scores(scores)
+            differences = export_run(run / WEIGHTS_NAME, run / CARD_NAME, out, on_real_sets)
     _tell_differences(differences)
 
 

@@ -119,7 +119,7 @@ def align_patches(
     half_octaves = np.round(np.log2(determinant[rows])).astype(np.int32)
     given = points0[rows], places[rows], back[rows], tilt[rows], half_octaves
     of_rows = None if source is None else source[rows]
-    found = align(image0, image1, *given, radius, iterations, taper, of_rows)
+    found = align(image0, image1, *given, radius, iterations, taper, source=of_rows)
     shift, correlation = found[:, :2], found[:, 2]
     spacing = np.maximum(1.0, 2.0 ** (0.5 * half_octaves))
     fits = (correlation > _MIN_CORRELATION) & (np.hypot(*shift.T) <= reach * spacing)

@@ -22,7 +22,7 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.frontend.nearest_neighbours import Putative, nearest_anywhere
 from sigmaslam.frontend.rival_matches import count_rivals, share_with_rivals
-from sigmaslam.frontend.types import Features, check_grey
+from sigmaslam.frontend.types import Features, Refinement, check_grey
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.readers.images import read_grey
 from sigmaslam.table import Table
@@ -44,6 +44,8 @@ _MAX_LINES = 60
 # Lines begin so far apart at least, as a share of the image's longer side.
 _LINE_SPACING = 0.04
 
+_Pair = tuple[np.ndarray, np.ndarray, Features, Features]
+"""Two images (H, W) uint8, and the features of each."""
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -103,7 +105,7 @@ def match_images(
     (image0, pixels0), (image1, pixels1) = _shrunk(_checked(image0, "image0")), _shrunk(_checked(image1, "image1"))
     features0, features1 = detect(image0), detect(image1)
     estimator = ConfidenceEstimator(provider=provider, weights=weights)
-    matches = _match_and_doubt(detect, estimator, image0, image1, features0, features1, min_probability)
+    matches = _match_and_doubt(detect, estimator, (image0, image1, features0, features1), min_probability)
     return _enlarged(matches, pixels0, pixels1)
 
 
@@ -124,7 +126,7 @@ def match_features(
         min_probability: as `match_images` takes it.
     """
     putative = nearest_anywhere(features0.descriptors, features1.descriptors)
-    matches = _refined(estimator, image0, image1, features0, features1, putative)
+    matches = _refined(estimator, (image0, image1, features0, features1), putative)
     return matches.select(matches.probability >= min_probability)
 
 
@@ -153,7 +155,7 @@ def match_twice(
     if geometry is None:
         return first.select(first.probability >= min_probability)
     putative = nearest_near_lines(geometry, features0, features1, settled.index0, settled.index1)
-    second = _refined(estimator, image0, image1, features0, features1, putative)
+    second = _refined(estimator, (image0, image1, features0, features1), putative)
     # Improbable matches stay where nothing took their keypoints.
     free = ~probable & ~np.isin(first.index0, second.index0) & ~np.isin(first.index1, second.index1)
     matches = Matches.concatenate([second, first.select(free)]).by_probability()
@@ -161,20 +163,15 @@ def match_twice(
 
 
 def _match_and_doubt(
-    detect: Callable[[np.ndarray], Features],
-    estimator: ConfidenceEstimator,
-    image0: np.ndarray,
-    image1: np.ndarray,
-    features0: Features,
-    features1: Features,
-    min_probability: float,
+    detect: Callable[[np.ndarray], Features], estimator: ConfidenceEstimator, pair: _Pair, min_probability: float
 ) -> Matches:
     """As `match_twice`; probabilities are lowered, with a warning, where other matches agree with each other as well.
 
     Either the scene repeats itself, or few match but many would with image 1 upside down: symmetric details then match
     with confidence, a little beside themselves.
     """
-    matches = match_twice(estimator, image0, image1, features0, features1, min_probability)
+    image0, image1, features0, features1 = pair
+    matches = match_twice(estimator, *pair, min_probability)
     probable = matches.probability >= MIN_PROBABILITY
     count = int(probable.sum())
     if count < _BELIEVED:
@@ -198,24 +195,14 @@ def _match_and_doubt(
     return matches.select(matches.probability >= min_probability)
 
 
-def _refined(
-    estimator: ConfidenceEstimator,
-    image0: np.ndarray,
-    image1: np.ndarray,
-    features0: Features,
-    features1: Features,
-    putative: Putative,
-) -> Matches:
+def _refined(estimator: ConfidenceEstimator, pair: _Pair, putative: Putative) -> Matches:
     """Putative matches that the scorer does not refuse, aligned, the most probable first."""
-    matches = refine_with_confidence(
-        estimator,
-        image0,
-        image1,
-        features0,
-        features1,
-        putative,
-        lambda points0, points1, _, logit: refine_by_neighbours(image0, image1, points0, points1, logit),
-    )
+    image0, image1, features0, _ = pair
+
+    def refine(points0: np.ndarray, points1: np.ndarray, _: np.ndarray, logit: np.ndarray) -> Refinement:
+        return refine_by_neighbours(image0, image1, points0, points1, logit)
+
+    matches = refine_with_confidence(estimator, *pair, putative, refine)
     keypoints, places = features0.keypoints[matches.index0], matches.places.astype(np.float32)
     columns = keypoints, places, matches.probability, matches.covariance, matches.index0, matches.index1
     return Matches(*columns).by_probability()
@@ -250,7 +237,7 @@ def match_files(
     (small0, pixels0), (small1, pixels1) = _shrunk(image0), _shrunk(image1)
     features0, features1 = detect(small0), detect(small1)
     detected = time.perf_counter()
-    matches = _match_and_doubt(detect, estimator, small0, small1, features0, features1, min_probability)
+    matches = _match_and_doubt(detect, estimator, (small0, small1, features0, features1), min_probability)
     matches = _enlarged(matches, pixels0, pixels1)
     end = time.perf_counter()
     with atomic_path(out) as temporary:

@@ -11,7 +11,7 @@ of the pixels would be off by up to 0.015 px, alike where all move alike.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, wraps
 from types import ModuleType
 
 import numpy as np
@@ -39,8 +39,28 @@ _FLAT, _RIDGE = np.float32(1e-2), np.float32(1e-6)
 _CHUNK = 128
 
 
+def _of_several(kernel: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    """A function of images 0 and 1, rows of their matches, and numbers, for several images 0, too."""
+
+    @wraps(kernel)
+    def run(
+        image0: Images, image1: np.ndarray, *arguments: np.ndarray | float, source: np.ndarray | None = None
+    ) -> np.ndarray:
+        if source is None:
+            return kernel(image0, image1, *arguments)
+        parts = [np.flatnonzero(source == number) for number in range(len(image0))]
+        found = [
+            kernel(image, image1, *(each[some] if isinstance(each, np.ndarray) else each for each in arguments))
+            for image, some in zip(image0, parts, strict=True)
+        ]
+        return np.concatenate(found)[np.argsort(np.concatenate(parts))]
+
+    return run
+
+
+@_of_several
 def align(
-    image0: Images,
+    image0: np.ndarray,
     image1: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
@@ -50,7 +70,6 @@ def align(
     radius: int,
     iterations: int,
     taper: float,
-    source: np.ndarray | None = None,
 ) -> np.ndarray:
     """Inverse compositional Lucas-Kanade over a shift (Baker & Matthews 2004), gain and offset of grey values free.
 
@@ -65,12 +84,32 @@ def align(
         radius: of the patches, samples.
         iterations: Gauss-Newton steps, each at most one sample long.
         taper: standard deviation of the patches' Gaussian window, radii.
-        source: (M,) which of the images 0 each match comes from; None: there is one.
+        source: by its name; (M,) which of the images 0 each match comes from; None: there is one.
     Returns:
         (M, 3) float64: shift of the place in image 1, pixels, and the correlation of the patches there.
     """
-    rows = points0, points1, back, tilt, half_octaves
-    return _by_source(align_reference, image0, source, image1, rows, (radius, iterations, taper))
+    result = np.zeros((len(points0), 3))
+    window = _window(radius, taper)
+    for step, rows in _groups(half_octaves):
+        spacing = 2.0 ** (0.5 * max(step, 0))
+        grid = spacing * _grid(radius)
+        template = sample(image0, points0[rows, None] + _warped(grid, back[rows], tilt[rows]), max(-step, 0))
+        template = _normalised(template, window)
+        along_u, along_v = _gradients(template, radius, spacing)
+        gradient = np.stack([along_u, along_v], axis=1)
+        weighted = gradient * window
+        normal = weighted @ gradient.transpose(0, 2, 1) + _RIDGE * np.eye(2, dtype=np.float32)
+        towards = np.linalg.inv(normal) @ weighted
+        shift = np.zeros((len(rows), 2))
+        for _ in range(iterations):
+            patch = sample(image1, (points1[rows] + shift)[:, None] + grid, max(step, 0))
+            error = _normalised(patch, window) - template
+            move = (towards @ error[..., None])[..., 0].astype(np.float64)
+            length = np.linalg.norm(move, axis=1, keepdims=True)
+            shift -= move * np.minimum(1.0, spacing / np.maximum(length, 1e-9))
+        patch = _normalised(sample(image1, (points1[rows] + shift)[:, None] + grid, max(step, 0)), window)
+        result[rows, :2], result[rows, 2] = shift, (patch * template) @ window
+    return result
 
 
 def examine(
@@ -94,7 +133,7 @@ def examine(
     kernels = compiled()
     rows = points0, points1, back, half_octaves
     if kernels is None:
-        return _by_source(examine_reference, image0, source, image1, rows, (radius, taper, flat))
+        return examine_reference(image0, image1, *rows, radius, taper, flat, source=source)
     found: np.ndarray = kernels.examine(*sources(image0, source), image1, *rows, 2 * radius + 1, taper * radius, flat)
     return found
 
@@ -129,62 +168,7 @@ def sources(image0: Images, source: np.ndarray | None) -> tuple[list[np.ndarray]
 # ---- the reference
 
 
-def _by_source(
-    kernel: Callable[..., np.ndarray],
-    image0: Images,
-    source: np.ndarray | None,
-    image1: np.ndarray,
-    rows: tuple[np.ndarray, ...],
-    settings: tuple[float, ...],
-) -> np.ndarray:
-    """What a function of two images and the rows of their matches gives where there are several images 0."""
-    if source is None:
-        return kernel(image0, image1, *rows, *settings)
-    parts = [np.flatnonzero(source == number) for number in range(len(image0))]
-    found = [
-        kernel(image, image1, *(each[some] for each in rows), *settings)
-        for image, some in zip(image0, parts, strict=True)
-    ]
-    return np.concatenate(found)[np.argsort(np.concatenate(parts))]
-
-
-def align_reference(
-    image0: np.ndarray,
-    image1: np.ndarray,
-    points0: np.ndarray,
-    points1: np.ndarray,
-    back: np.ndarray,
-    tilt: np.ndarray,
-    half_octaves: np.ndarray,
-    radius: int,
-    iterations: int,
-    taper: float,
-) -> np.ndarray:
-    """`align` in NumPy."""
-    result = np.zeros((len(points0), 3))
-    window = _window(radius, taper)
-    for step, rows in _groups(half_octaves):
-        spacing = 2.0 ** (0.5 * max(step, 0))
-        grid = spacing * _grid(radius)
-        template = sample(image0, points0[rows, None] + _warped(grid, back[rows], tilt[rows]), max(-step, 0))
-        template = _normalised(template, window)
-        along_u, along_v = _gradients(template, radius, spacing)
-        gradient = np.stack([along_u, along_v], axis=1)
-        weighted = gradient * window
-        normal = weighted @ gradient.transpose(0, 2, 1) + _RIDGE * np.eye(2, dtype=np.float32)
-        towards = np.linalg.inv(normal) @ weighted
-        shift = np.zeros((len(rows), 2))
-        for _ in range(iterations):
-            patch = sample(image1, (points1[rows] + shift)[:, None] + grid, max(step, 0))
-            error = _normalised(patch, window) - template
-            move = (towards @ error[..., None])[..., 0].astype(np.float64)
-            length = np.linalg.norm(move, axis=1, keepdims=True)
-            shift -= move * np.minimum(1.0, spacing / np.maximum(length, 1e-9))
-        patch = _normalised(sample(image1, (points1[rows] + shift)[:, None] + grid, max(step, 0)), window)
-        result[rows, :2], result[rows, 2] = shift, (patch * template) @ window
-    return result
-
-
+@_of_several
 def examine_reference(
     image0: np.ndarray,
     image1: np.ndarray,

@@ -1,1 +1,1 @@
-"""What sees a run while it goes on: streams, videos, viewers."""
+"""What sees a run while it goes on: streams, videos, viewers, a web page."""

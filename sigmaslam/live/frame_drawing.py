@@ -30,6 +30,8 @@ _TRAIL = 8
 # Matches by their probability: colours from 0 to 1.
 _SHADES = cv2.applyColorMap(np.linspace(0, 255, 12).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0]
 _HEIGHT, _MAX_WIDTH = 480, 1280
+# With more poses every other one, and every other point, is left out, so that long runs are drawn as fast; odd.
+_MOST_POSES = 2001
 _LINES, _LINE = 5, 19  # of text, and pixels of each
 _DIMMED = 0.8
 # Share of the plan that the path and the points fill, steps of its scale an octave, and the grey of a black point.
@@ -39,52 +41,66 @@ _SHIFT = 4
 
 
 class FramePainter:
-    """Draws frames in order; each picture shows the path until then.
+    """Takes frames in order and draws the newest one, with the path until then.
 
     Args:
         camera: of the raw images.
+
+    Attributes:
+        plan: what is drawn beside the image.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
         self._trails = MatchTrails()
-        self._plan = _Plan(KeyframePoints(camera))
+        self.plan = Plan(KeyframePoints(camera))
+        self._newest: tuple[TrackedFrame, MatchedFrame] | None = None
 
-    def draw(self, frame: TrackedFrame) -> np.ndarray:
-        """(H, W, 3) uint8 in OpenCV's order of colours, of the same even size for every frame of a run."""
+    def add(self, frame: TrackedFrame) -> None:
+        """Takes a frame, which costs little."""
         assert frame.seen is not None
-        height, width = frame.seen.left.shape
+        self._newest = frame, frame.seen
+        self._trails.add(frame.seen)
+        self.plan.add(frame)
+
+    def draw(self) -> np.ndarray:
+        """(H, W, 3) uint8 in OpenCV's order of colours, of the same even size for every frame of a run.
+
+        The left image is on the left, a square of the plan and of words on the right.
+        """
+        assert self._newest is not None
+        frame, seen = self._newest
+        height, width = seen.left.shape
         scale = min(_HEIGHT / height, _MAX_WIDTH / width)
         size = 2 * round(0.5 * scale * width), 2 * round(0.5 * scale * height)
-        image = _draw_matches(frame.seen, self._trails, size)
-        self._plan.add(frame)
-        words = self._plan.describe(frame)
+        image = _draw_matches(seen, self._trails, size)
+        words = self.plan.describe(frame)
         panel = np.full((size[1], size[1], 3), _BACKGROUND, np.uint8)
-        self._plan.draw(panel[: size[1] - _LINES * _LINE - 8])
+        self.plan.draw(panel[: size[1] - _LINES * _LINE - 8])
         for k, (text, colour) in enumerate(words):
             _write(panel, text, (12, size[1] - _LINES * _LINE + k * _LINE + 8), colour)
         return np.hstack([image, panel])
 
 
 class MatchTrails:
-    """Where the landmarks of an image were in those before."""
+    """Where the landmarks of the newest image were in those before."""
 
     def __init__(self) -> None:
-        self._before: deque[MatchedFrame] = deque(maxlen=_TRAIL)
+        self._frames: deque[MatchedFrame] = deque(maxlen=_TRAIL + 1)
 
-    def add(self, frame: MatchedFrame) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Takes a frame.
+    def add(self, frame: MatchedFrame) -> None:
+        """Takes a frame."""
+        self._frames.appendleft(frame)
 
-        Returns:
-            (K,) rows of its matches that the pose agrees with, and of each the places (T, 2), the latest first.
-        """
+    def follow(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """(K,) rows of the matches that the pose agrees with, and of each the places (T, 2), the latest first."""
+        frame, *earlier = self._frames
         rows = np.flatnonzero(frame.inliers)
         steps = np.full((_TRAIL + 1, len(rows), 2), np.nan)
         steps[0] = frame.pixels[rows]
-        for k, before in enumerate(self._before, start=1):
+        for k, before in enumerate(earlier, start=1):
             _, here, there = np.intersect1d(frame.landmark[rows], before.landmark, return_indices=True)
             # A trail ends where the landmark was not matched.
             steps[k, here] = np.where(np.isnan(steps[k - 1, here]), np.nan, before.pixels[there])
-        self._before.appendleft(frame)
         length = np.isfinite(steps[..., 0]).sum(axis=0)
         return rows, [steps[: length[k], k] for k in range(len(rows))]
 
@@ -103,7 +119,7 @@ def _draw_matches(frame: MatchedFrame, trails: MatchTrails, size: tuple[int, int
 
     grey = cv2.resize(frame.left, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
     picture = cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=_DIMMED), cv2.COLOR_GRAY2BGR)
-    rows, steps = trails.add(frame)
+    rows, steps = trails.follow()
     for trail, colour in zip(steps, shade_matches(frame.matches.probability[rows]).tolist(), strict=True):
         _draw_lines(picture, [_fixed_point(place(trail))], colour)
         cv2.circle(picture, _pair(place(trail[0])), 5 << (_SHIFT - 1), colour, -1, cv2.LINE_AA, _SHIFT)
@@ -114,8 +130,12 @@ def _draw_matches(frame: MatchedFrame, trails: MatchTrails, size: tuple[int, int
     return np.asarray(picture)
 
 
-class _Plan:
-    """The path and the points of keyframes, seen along the y axis of the first camera, which points down."""
+class Plan:
+    """The path and the points of keyframes, seen along the y axis of the first camera, which points down.
+
+    Attributes:
+        count: of the points so far.
+    """
 
     def __init__(self, points: KeyframePoints) -> None:
         self._keyframe_points = points
@@ -124,6 +144,7 @@ class _Plan:
         self._path: list[np.ndarray] = []
         self._status: list[str] = []
         self._length = 0.0
+        self._poses, self._step, self.count = 0, 1, 0
         self._position: np.ndarray | None = None
         self._covariance = np.zeros((2, 2))
         self._heading = np.array([0.0, 1.0])
@@ -139,14 +160,22 @@ class _Plan:
         if self._position is not None:
             self._length += float(np.linalg.norm(position - self._position))
         self._position = position
+        if (self._poses - 1) % self._step:  # the last pose was drawn as the newest alone
+            del self._path[-1], self._status[-1]
         self._path.append(position[[0, 2]])
         self._status.append(estimate.status)
+        self._poses += 1
         self._heading = rotation[[0, 2], 2]
         self._covariance = (rotation @ result.pose_covariance[:3, :3] @ rotation.T)[np.ix_([0, 2], [0, 2])]
         if not isinstance(result, ObjectEstimate):
             points, grey = self._keyframe_points.add(frame)
-            self._points.append(points[:, [0, 2]])
-            self._grey.append(grey)
+            self.count += len(points)
+            self._points.append(points[:: self._step, [0, 2]])
+            self._grey.append(grey[:: self._step])
+        if len(self._path) == _MOST_POSES:
+            self._step *= 2
+            del self._path[1::2], self._status[1::2]
+            self._points, self._grey = [np.concatenate(self._points)[::2]], [np.concatenate(self._grey)[::2]]
 
     def describe(self, frame: TrackedFrame) -> list[tuple[str, Sequence[float]]]:
         """Lines of text and their colours."""
@@ -175,7 +204,9 @@ class _Plan:
         path = np.array(self._path)
         points = np.concatenate([np.zeros((0, 2)), *self._points])
         height, width = panel.shape[:2]
-        low, high = _extent(path, points)
+        low, high = extent(path, points, path[-1], 5.0)
+        margin = max(0.1 * float(np.max(high - low)), 1e-3)
+        low, high = low - margin, high + margin
         scale = _MARGIN * min(width / (high[0] - low[0]), height / (high[1] - low[1]))
         # In steps, so that the view does not creep.
         scale = float(2.0 ** (np.floor(_STEPS * np.log2(scale)) / _STEPS))
@@ -214,19 +245,22 @@ class _Plan:
             cv2.ellipse(panel, _pair(at), _pair(half[::-1]), angle, 0.0, 360.0, colour, 1, cv2.LINE_AA, _SHIFT)
 
 
-def _extent(path: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,), (2,) of what is shown: the path (P, 2), and the points (N, 2) as far as they are near; metres."""
+def extent(path: np.ndarray, points: np.ndarray, centre: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (D,), (D,) of what a view shows: the path, and the points as far as they are near.
+
+    Args:
+        path: (P, D) metres.
+        points: (N, D); the farthest are the least certain ones.
+        centre: (D,) from which points count as near, as the median one or 0.3 times the size of the path.
+        far: percent of the points on either side that are left out.
+    """
     low, high = path.min(axis=0), path.max(axis=0)
-    size = float(np.max(high - low))
     if len(points):
-        reach = max(0.3 * size, float(np.median(np.linalg.norm(points - path[-1], axis=1))))
-        near_low, near_high = np.percentile(points, (5, 95), axis=0)
-        low, high = (
-            np.minimum(low, np.maximum(near_low, low - reach)),
-            np.maximum(high, np.minimum(near_high, high + reach)),
-        )
-    least = max(0.1 * float(np.max(high - low)), 1e-3)
-    return low - least, high + least
+        reach = max(0.3 * float(np.max(high - low)), float(np.median(np.linalg.norm(points - centre, axis=1))))
+        near_low, near_high = np.percentile(points, (far, 100.0 - far), axis=0)
+        low = np.minimum(low, np.maximum(near_low, low - reach))
+        high = np.maximum(high, np.minimum(near_high, high + reach))
+    return low, high
 
 
 def format_length(metres: float) -> str:

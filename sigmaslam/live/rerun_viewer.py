@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import socket
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -29,38 +31,47 @@ _QUALITY = 80
 _FIRST_DATE = 1e8
 # Of the frustum of a keyframe: its depth as a share of the median depth of the points that it shows first.
 _FRUSTUM = 0.05
-# How long a run that has ended waits for the window, seconds.
+# How long a run waits for a viewer to answer, and in the end to take the last frames, seconds.
 _PATIENCE = 10.0
+_PORT = 9876
+"""Where viewers listen."""
 
 
 class RerunSink:
-    """Shows a run in a window, or writes what a window would show.
+    """Shows a run in a window, here or on another machine, or writes what a window would show.
 
     Args:
-        path: of an .rrd to write; None: open a window.
+        target: path of an .rrd to write; URL of a viewer that is open; None: open a window.
         camera: of the raw images.
 
     Attributes:
         name: of the file, or of the viewer.
     Raises:
-        OutputError: the window does not open.
+        OutputError: the window does not open, or no viewer answers.
     """
 
-    def __init__(self, path: Path | None, camera: StereoCamera) -> None:
-        self.name = "the viewer" if path is None else str(path)
-        self._path = path
+    def __init__(self, target: Path | str | None, camera: StereoCamera) -> None:
+        self.name = str(target or "the viewer")
+        self._path = target if isinstance(target, Path) else None
         self._trails, self._points = MatchTrails(), KeyframePoints(camera)
         self._positions: list[np.ndarray] = []
         self._colours: list[tuple[int, int, int]] = []
         self._depth, self._clouds = 1.0, 0
         self._recording = rr.RecordingStream("sigmaslam")
         self._is_open = False
-        if path is None:
-            try:
+        if self._path is not None:
+            return
+        try:
+            if isinstance(target, str):
+                place = urlsplit(target)
+                socket.create_connection((place.hostname or "", place.port or _PORT), _PATIENCE).close()
+                self._recording.connect_grpc(target, default_blueprint=_blueprint())
+            else:
                 self._recording.spawn(default_blueprint=_blueprint())
-            except Exception as error:
-                raise OutputError(f"--viewer rerun: no window opens ({error}); give rerun:FILE.rrd") from error
-            self._begin()
+        except Exception as error:
+            mend = "give rerun:FILE.rrd" if target is None else "start `rerun` there, and give what it listens on"
+            raise OutputError(f"--viewer {target or 'rerun'}: no viewer answers ({error}); {mend}") from error
+        self._begin()
 
     def add(self, frame: TrackedFrame) -> None:
         """Shows a frame."""
@@ -113,7 +124,8 @@ class RerunSink:
     def _show_image(self, seen: MatchedFrame) -> None:
         _, encoded = cv2.imencode(".jpg", seen.left, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         self._recording.log(IMAGE, rr.EncodedImage(contents=encoded.tobytes(), media_type="image/jpeg"))
-        rows, trails = self._trails.add(seen)
+        self._trails.add(seen)
+        rows, trails = self._trails.follow()
         colours = shade_matches(seen.matches.probability[rows])[:, ::-1]
         # Rerun has the origin in the corner of the first pixel, we in its centre.
         self._recording.log(f"{IMAGE}/trails", rr.LineStrips2D([trail + 0.5 for trail in trails], colors=colours))

@@ -40,7 +40,8 @@ class VideoSink:
     def add(self, frame: TrackedFrame) -> None:
         """Draws a frame and writes it."""
         self._count += 1
-        picture = self._painter.draw(frame)
+        self._painter.add(frame)
+        picture = self._painter.draw()
         if self._writer is not None:
             self._writer.write(picture)
             return

@@ -79,6 +79,9 @@ def _detect(path: Path) -> str:
         return "video"
     if single := kitti.find_single_eye(path):
         raise InputError(f"{path}: holds {single[0]} and no {single[1]}, the images of the other eye: put them there")
+    above = path.absolute().parent
+    if any(find(above) for find in (kitti.find_layout, euroc.find_asl_root, folder.find_eyes)):
+        raise InputError(f"{path}: has one eye at most: give the folder above it, {above}")
     looked_for = "".join(
         f"\n  {format}: {module.LOOKED_FOR}"
         for format, module in zip(FORMATS[1:], (kitti, euroc, four_seasons, folder, video, bag), strict=True)

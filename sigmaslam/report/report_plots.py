@@ -34,15 +34,15 @@ def build_plots(run: RecordedRun) -> list[dict[str, Any]]:
     """
     plots = [
         *_sigmas(run),
-        _nees(run),
+        *_nees(run),
         _nis(run.frames),
         _inliers(run.frames),
         _offset(run.frames),
         *_inertial(run),
-        _times(run.frames),
+        *_times(run.frames),
         _belief(run.frames),
     ]
-    return [plot for plot in plots if plot is not None]
+    return [plot for plot in plots if _has_numbers(*(each["values"] for each in plot["series"]))]
 
 
 def _line(label: str, values: np.ndarray, colour: str, **style: Any) -> dict[str, Any]:
@@ -75,9 +75,8 @@ def _sigmas(run: RecordedRun) -> list[dict[str, Any]]:
             error = scale * (errors.position_error if kind == "position" else errors.rotation_error)
             caption += " The error is that of the pose relative to the first one with a truth."
             series.append(_line("error", run.of_frames(error, errors.row), VERMILLION, width=2, compared="error"))
-        if _has_numbers(claimed):
-            is_wide = _is_wide(np.concatenate([each["values"] for each in series]))
-            plots.append(_plot(f"Error of the {kind} [{unit}]", caption, series, log=is_wide))
+        is_wide = _is_wide(np.concatenate([each["values"] for each in series]))
+        plots.append(_plot(f"Error of the {kind} [{unit}]", caption, series, log=is_wide))
     return plots
 
 
@@ -88,9 +87,9 @@ def _band(low: np.ndarray, high: np.ndarray, label: str) -> list[dict[str, Any]]
 _BANDS = [{"series": [1, 2], "fill": "rgb(0 158 115 / 20%)"}]
 
 
-def _nees(run: RecordedRun) -> dict[str, Any] | None:
+def _nees(run: RecordedRun) -> list[dict[str, Any]]:
     if run.evaluated is None or not _has_numbers(run.evaluated.nees):
-        return None
+        return []
     ratio = run.of_frames(run.evaluated.nees, run.evaluated.row)
     low, high = (np.full(len(ratio), bound) for bound in CHI_SQUARE_BAND_OF_6 / 6.0)
     caption = (
@@ -98,13 +97,11 @@ def _nees(run: RecordedRun) -> dict[str, Any] | None:
         "small. The band holds 95 % of a right one's."
     )
     series = [*_band(low, high, "95 %"), _line("NEES / dof", ratio, BLUE, dots=True, compared="")]
-    return _plot("NEES", caption, series, log=True, bands=_BANDS)
+    return [_plot("NEES", caption, series, log=True, bands=_BANDS)]
 
 
-def _nis(frames: FrameTable) -> dict[str, Any] | None:
+def _nis(frames: FrameTable) -> dict[str, Any]:
     ratio = nis_per_dof(frames)
-    if not _has_numbers(ratio):
-        return None
     # (chi2 / dof)^(1/3) is nearly normal (Wilson and Hilferty).
     dof = np.where(frames.columns["dof"] > 0, frames.columns["dof"], np.nan)
     spread = np.sqrt(2 / (9 * dof))
@@ -117,18 +114,14 @@ def _nis(frames: FrameTable) -> dict[str, Any] | None:
     return _plot("NIS", caption, series, log=True, bands=_BANDS)
 
 
-def _inliers(frames: FrameTable) -> dict[str, Any] | None:
+def _inliers(frames: FrameTable) -> dict[str, Any]:
     matches, inliers = frames.columns["matches"], frames.columns["inliers"]
-    if not _has_numbers(matches, inliers):
-        return None
     series = [_line("matches", matches, BLUE), _line("inliers", inliers, VERMILLION, compared="")]
     return _plot("Matches and inliers", "Inliers are the matches that the filter used.", series)
 
 
-def _offset(frames: FrameTable) -> dict[str, Any] | None:
+def _offset(frames: FrameTable) -> dict[str, Any]:
     offset, sigma = frames.columns["disparity_offset"], frames.columns["disparity_offset_sigma"]
-    if not _has_numbers(offset):
-        return None
     series = [
         _line("+ 2 sigma", offset + 2 * sigma, GREY, width=0.5),
         _line("- 2 sigma", offset - 2 * sigma, GREY, width=0.5),
@@ -167,17 +160,15 @@ def _inertial(run: RecordedRun) -> list[dict[str, Any]]:
     ]
 
 
-def _belief(frames: FrameTable) -> dict[str, Any] | None:
+def _belief(frames: FrameTable) -> dict[str, Any]:
     belief = frames.columns["belief"]
-    if not _has_numbers(belief):
-        return None
     caption = "How far the tracker believes each of its poses, 0 to 1."
     return _plot("Belief", caption, [_line("belief", belief, BLUE, compared="")], range=[-0.03, 1.03])
 
 
-def _times(frames: FrameTable) -> dict[str, Any] | None:
+def _times(frames: FrameTable) -> list[dict[str, Any]]:
     if not _has_numbers(frames.total_milliseconds):
-        return None
+        return []
     names = list(frames.milliseconds)
     stacked = np.cumsum(np.nan_to_num(np.array([frames.milliseconds[name] for name in names])), axis=0)
     stacked[:, ~np.isfinite(frames.total_milliseconds)] = np.nan
@@ -198,7 +189,7 @@ def _times(frames: FrameTable) -> dict[str, Any] | None:
     if interval is not None:
         series.append(_line("real time", np.full(len(frames), 1e3 * interval), GREY, width=1.5, dash=[6, 4]))
         caption += f" Frames come every {1e3 * interval:.0f} ms."
-    return _plot("Time spent [ms]", caption, series)
+    return [_plot("Time spent [ms]", caption, series)]
 
 
 def frame_interval(frames: FrameTable) -> float | None:

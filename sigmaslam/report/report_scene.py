@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.geometry.se3 import transform_points
-from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.live.frame_drawing import extent
 from sigmaslam.run_record.frame_table import STATUSES
 from sigmaslam.run_record.recorded_run import RecordedRun
 
@@ -58,12 +58,12 @@ def build_scene(run: RecordedRun, most: int = MAX_POSES, start: float | None = N
     }
     if run.dense is not None:
         scene |= {"dense": run.dense.points, "dense_grey": run.dense.intensity}
-    others: dict[str, np.ndarray | None] = {
-        "truth": None if run.evaluated is None else run.evaluated.truth,
-        "final": _positions(run.final),
-        "refined": _positions(run.refined),
+    others = {
+        name: line.positions for name, line in (("final", run.final), ("refined", run.refined)) if line is not None
     }
-    return scene | {name: line[_even(len(line), most)] for name, line in others.items() if line is not None}
+    if run.evaluated is not None:
+        others["truth"] = run.evaluated.truth
+    return scene | {name: line[_even(len(line), most)] for name, line in others.items()}
 
 
 def _even(count: int, most: int) -> np.ndarray:
@@ -71,22 +71,12 @@ def _even(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64)) if count else np.zeros(0, np.int64)
 
 
-def _positions(trajectory: Trajectory | None) -> np.ndarray | None:
-    return None if trajectory is None else trajectory.positions
-
-
 def _extent(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,), (3,) of what the view shows: the path, and the map as far as it is near."""
-    low, high = run.trajectory.positions.min(axis=0), run.trajectory.positions.max(axis=0)
-    if run.map is not None and len(run.map.points):
-        # Far points are the least certain ones.
-        points = _placed_points(run)
-        distance = float(np.median(np.linalg.norm(points - 0.5 * (low + high), axis=1)))
-        margin = max(0.3 * float(np.max(high - low)), distance)
-        near_low, near_high = np.percentile(points, (10, 90), axis=0)
-        low = np.minimum(low, np.maximum(near_low, low - margin))
-        high = np.maximum(high, np.minimum(near_high, high + margin))
-    return low, high
+    """Corners (3,), (3,) of what the view shows."""
+    path = run.trajectory.positions
+    if run.map is None:
+        return path.min(axis=0), path.max(axis=0)
+    return extent(path, _placed_points(run), 0.5 * (path.min(axis=0) + path.max(axis=0)), 10.0)
 
 
 def _placed_points(run: RecordedRun) -> np.ndarray:

@@ -170,7 +170,7 @@ class LiveOptions:
     """Who is told of frames while the run goes on.
 
     Attributes:
-        stream, video, viewer, dense: sinks that the command opens.
+        stream, video, viewer, serve, dense: sinks that the command opens.
         on_estimate: called with the estimate of each frame when it is on disk; an error that it raises ends the run.
         sinks: take each frame after that, and are closed in the end.
     """
@@ -178,6 +178,7 @@ class LiveOptions:
     stream: str | None = None
     video: Path | None = None
     viewer: str | None = None
+    serve: str | None = None
     dense: Path | None = None
     on_estimate: Callable[[Estimate | ObjectEstimate], None] | None = None
     sinks: Sequence[FrameSink] = ()

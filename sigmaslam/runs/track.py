@@ -260,7 +260,12 @@ def _sensors(sequence: StereoSequence, tracker: Tracker) -> list[_Samples]:
 
 
 class _Rows:
-    """Rows of frames.csv, and who is told of them; of a run that goes on none is written twice."""
+    """Rows of frames.csv, and who is told of them; of a run that goes on none is written twice.
+
+    Attributes:
+        count: of the rows, those before a stop included.
+        skipped: frames that could not be read, so far.
+    """
 
     def __init__(
         self,
@@ -270,9 +275,8 @@ class _Rows:
         listeners: Sequence[Callable[[TrackedFrame], None]],
     ) -> None:
         self.sequence, self._writer, self._stopped, self._listeners = sequence, writer, stopped, listeners
-        self._count = 0 if stopped is None else len(stopped.timestamps)
+        self.count = 0 if stopped is None else len(stopped.timestamps)
         self.skipped = 0
-        """Frames that could not be read, so far."""
 
     def frames(self, frames: Iterator[StereoFrame]) -> Iterator[StereoFrame]:
         """Those of the sequence from which the run goes on."""
@@ -285,7 +289,7 @@ class _Rows:
                 break
             if self._is_new(skipped.timestamp):
                 self._writer.add_skipped(skipped.timestamp)
-                self._count += 1
+                self.count += 1
             self.skipped += 1
 
     def add(self, result: Estimate | ObjectEstimate, seen: MatchedFrame | None, read_ms: float) -> None:
@@ -294,8 +298,8 @@ class _Rows:
             covariances = result.pose_covariance, result.pose_matching_covariance
             self._writer.add(result.camera, result.pose, *covariances, read_ms)
             for listener in self._listeners:
-                listener(TrackedFrame(self._count, result, seen))
-            self._count += 1
+                listener(TrackedFrame(self.count, result, seen))
+            self.count += 1
 
     def check_first(self, result: Estimate | ObjectEstimate) -> None:
         """InputError where the first frame of a run that goes on is no keyframe again."""
@@ -313,22 +317,21 @@ def _track(frames: Iterator[StereoFrame], steps: _FrameSteps, rows: _Rows, pictu
     timing, tracker = steps.timing, steps.tracker
     with open_progress() as progress:
         task = progress.add_task("frames", total=rows.sequence.length, note="")
-        done, lost = 0, 0
+        lost = 0
         began = since = time.perf_counter()
-        for frame in rows.frames(frames):
+        for done, frame in enumerate(rows.frames(frames), start=1):
             read_ms = 1e3 * (time.perf_counter() - since - timing.waited)
             rows.add_skipped(frame.timestamp)
             result = steps.step(frame)
-            if not done:
+            if done == 1:
                 rows.check_first(result)
             rows.add(result, tracker.last_frame, read_ms)
             if tracker.last_frame is not None:
                 pictures.add(result.camera, tracker.last_frame)
-            done += 1
             lost += result.status == "lost"
             since = time.perf_counter()
             rate, camera = done / (since - began), result.camera
             note = f"{rate:.1f} frames/s, {lost} lost; {camera.status}, {camera.inliers} inliers"
-            progress.update(task, completed=done + rows.skipped + timing.dropped + rows.sequence.dropped, note=note)
+            progress.update(task, completed=rows.count + timing.dropped + rows.sequence.dropped, note=note)
         rows.add_skipped()
-        progress.update(task, completed=done + rows.skipped + timing.dropped + rows.sequence.dropped)
+        progress.update(task, completed=rows.count + timing.dropped + rows.sequence.dropped)

@@ -12,15 +12,14 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from sigmaslam.calibration_files.foreign_calibrations import write_foreign_calibration
 from sigmaslam.files import atomic_path, atomic_write_text
-from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti
 from sigmaslam_synthetic.inertial import SimulatedInertial
 from sigmaslam_synthetic.simulation import Simulation
 
 _FIRST_STAMP = 1_600_000_000_000_000_000  # nanoseconds; EuRoC's stamps count from 1970
-_DISTORTION_NAMES = {"none": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}
 
 
 def image_paths(out: Path, simulation: Simulation, frame: int) -> tuple[Path, Path]:
@@ -80,11 +79,7 @@ def _inertial_yaml(inertial: SimulatedInertial) -> str:
 
 
 def _write_kitti(out: Path, simulation: Simulation, poses: np.ndarray) -> None:
-    camera, baseline = simulation.rig.left, simulation.rig.calibrated.baseline
-    projection = np.concatenate([camera.matrix, np.zeros((3, 1))], axis=1)
-    right = projection.copy()
-    right[0, 3] = -camera.fx * baseline
-    atomic_write_text(out / "calib.txt", f"P0: {_row(projection)}\nP1: {_row(right)}\n")
+    write_foreign_calibration(out / "calib.txt", simulation.rig.calibrated, "kitti")
     atomic_write_text(out / "times.txt", "".join(f"{t:.6e}\n" for t in simulation.times))
     relative = np.linalg.inv(poses[0]) @ poses
     relative[0] = np.eye(4)
@@ -99,12 +94,10 @@ def _write_kitti(out: Path, simulation: Simulation, poses: np.ndarray) -> None:
 def _write_euroc(root: Path, simulation: Simulation, poses: np.ndarray) -> None:
     """The body of the ASL format is the left camera."""
     stamps = [_stamp(simulation, k) for k in range(simulation.frames)]
-    placed = ((simulation.rig.left, np.eye(4)), (simulation.rig.right, np.array(simulation.rig.T_left_right)))
-    for k, (camera, T_body_camera) in enumerate(placed):
-        folder = root / f"cam{k}"
-        atomic_write_text(folder / "sensor.yaml", _sensor_yaml(camera, T_body_camera, simulation.fps))
-        rows = [[stamp, f"{stamp}.png"] for stamp in stamps]
-        atomic_write_text(folder / "data.csv", _table(["#timestamp [ns]", "filename"], rows))
+    write_foreign_calibration(root, simulation.rig.calibrated, "euroc")
+    rows = [[stamp, f"{stamp}.png"] for stamp in stamps]
+    for name in ("cam0", "cam1"):
+        atomic_write_text(root / name / "data.csv", _table(["#timestamp [ns]", "filename"], rows))
     truth = root / "state_groundtruth_estimate0"
     truth.mkdir(exist_ok=True)
     orientation = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
@@ -114,21 +107,6 @@ def _write_euroc(root: Path, simulation: Simulation, poses: np.ndarray) -> None:
         for stamp, T, q in zip(stamps, poses, orientation, strict=True)
     ]
     atomic_write_text(truth / "data.csv", _table(header, rows))
-
-
-def _sensor_yaml(camera: CameraModel, T_body_camera: np.ndarray, fps: float) -> str:
-    content = {
-        "sensor_type": "camera",
-        "comment": "rendered",
-        "T_BS": {"cols": 4, "rows": 4, "data": [float(value) for value in T_body_camera.ravel()]},
-        "rate_hz": fps,
-        "resolution": [camera.width, camera.height],
-        "camera_model": "pinhole",
-        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "distortion_model": _DISTORTION_NAMES[camera.distortion_model],
-        "distortion_coefficients": list(camera.distortion) or [0.0] * 4,
-    }
-    return yaml.safe_dump(content, sort_keys=False)
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -152,7 +130,3 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([header, *rows])
     return text.getvalue()
-
-
-def _row(matrix: np.ndarray) -> str:
-    return " ".join(f"{value:.12e}" for value in matrix.ravel())

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sigmaslam.source_commit import describe_source
+from sigmaslam_benchmarks.source_description import describe_source
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sigmaslam.bounded_files import shorten
-from sigmaslam.source_commit import describe_source
+from sigmaslam_benchmarks.source_description import describe_source
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page
 from tests.faults.case import Case, Runner, Verdict, judge
 from tests.faults.running import attempt, run_in_process, run_in_this_process

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.source_commit import current_commit
 from sigmaslam_models.model_card import card_page, read_card, read_scores
 from sigmaslam_training.devices import Workplace
 from sigmaslam_training.features.checkpoint import TrainingState, begin
 from sigmaslam_training.run_card import describe_origin, make_card
+from sigmaslam_training.source_commit import current_commit
 
 PLACE = Workplace(torch.device("cpu"))
 

@@ -174,7 +174,7 @@ def test_every_world_of_render_is_a_source():
     ("saved", "words"),
     [
         (3, ["3 of 8 steps are saved in", "the same command with --resume goes on"]),
-        (0, ["none of 8 steps is saved", "give the same command again"]),
+        (0, ["0 of 8 steps are saved in", "give the same command again"]),
     ],
 )
 def test_a_stopped_run_says_what_is_saved_and_how_to_go_on(

@@ -6,11 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sigmaslam.source_commit import current_commit
 from sigmaslam_synthetic.worlds.own import SUFFIX
 from sigmaslam_training.devices import Workplace, describe_hardware
 from sigmaslam_training.features.checkpoint import TrainingState
 from sigmaslam_training.features.recipes import TrainingConfig
+from sigmaslam_training.source_commit import current_commit
 from sigmaslam_training.sources import SOURCES, label, turns_of
 
 CARD_NAME = "features.json"

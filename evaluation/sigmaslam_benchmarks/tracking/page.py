@@ -12,7 +12,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, csv_text
-from sigmaslam.source_commit import describe_source
+from sigmaslam_benchmarks.source_description import describe_source
 
 _MARK = "<!-- notes -->"
 _ASIDE = re.compile(r"<!-- rows ([\w-]+) -->\n(.*?)<!-- end -->\n", re.DOTALL)

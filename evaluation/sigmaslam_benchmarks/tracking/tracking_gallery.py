@@ -58,7 +58,8 @@ class Animation:
 
     def add(self, frame: TrackedFrame) -> None:
         """Draws a frame."""
-        self.pictures.append(self.painter.draw(frame))
+        self.painter.add(frame)
+        self.pictures.append(self.painter.draw())
         self.timestamps.append(frame.result.timestamp)
 
     def close(self) -> None:

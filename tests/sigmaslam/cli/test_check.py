@@ -59,6 +59,10 @@ def test_check_of_what_cannot_be_read_ends_with_code_2(tmp_path: Path):
     assert_refused(run_here("check", tmp_path), "no stereo sequence of a known format")
 
 
+def test_the_folder_of_one_eye_names_the_one_above(demo_sequence: Path):
+    assert_refused(run_here("check", demo_sequence / "image_0"), f"give the folder above it, {demo_sequence}")
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_track_warns_before_it_starts_and_keeps_the_findings(swapped: Path, tmp_path: Path):

@@ -106,7 +106,7 @@ def test_a_part_of_a_recording_is_tracked_in_small_and_may_replace_an_earlier_ru
     camera = json.loads((out / "run.json").read_text())["calibration"]["left"]
     stored = cv2.imread(str(next((whole_sequence / "image_0").iterdir())), cv2.IMREAD_GRAYSCALE)
     assert (2 * camera["height"], 2 * camera["width"]) == stored.shape
-    assert_refused(run_here("track", whole_sequence, "--out", out, *part), "not an empty folder")
+    assert_refused(run_here("track", whole_sequence, "--out", out, *part), "not an empty folder", "--overwrite")
     again = run_here("track", whole_sequence, "--out", out, "--overwrite", "--frames", "2", "--frontend", "klt")
     assert again.returncode in (0, 3)
     assert len(rows(out)) == 2

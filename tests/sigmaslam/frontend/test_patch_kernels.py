@@ -14,7 +14,7 @@ from sigmaslam.frontend.affine_alignment import align_patches
 from sigmaslam.frontend.followed_patches import compare_with_neighbours, correct_by_neighbours
 from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.frontend.motion_blur import extreme_sharpness
-from sigmaslam.frontend.patch_kernels import align_reference, examine_reference, sample
+from sigmaslam.frontend.patch_kernels import align, examine_reference, sample
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 
 WIDTH, HEIGHT = 160, 120
@@ -126,7 +126,7 @@ def test_without_a_compiler_the_twin_serves_and_says_so_once(images, monkeypatch
     with caplog.at_level(logging.WARNING):
         points0, points1, maps, tilt, size = mapped(20)
         found = [align_patches(*images, points0, points1, maps, tilt, *size) for _ in range(2)]
-    np.testing.assert_array_equal(found[0].correlation, align_reference(*images, *matches(20), 5, 3, 1.0)[:, 2])
+    np.testing.assert_array_equal(found[0].correlation, align(*images, *matches(20), 5, 3, 1.0)[:, 2])
     assert [record.message for record in caplog.records if "C++ compiler" in record.message] != []
     assert len(caplog.records) == 1
 

@@ -1,5 +1,7 @@
 """What is written for Rerun, read back by its own reader, is what the run said."""
 
+import socket
+import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -108,7 +110,37 @@ def test_the_path_ends_at_the_last_pose(run, logged):
     np.testing.assert_allclose(steps[:, 1], trajectory.positions[1:], atol=1e-6)
 
 
-@pytest.mark.parametrize("viewer", ["rviz", "rerun:", "rerun:there.mp4"])
+@pytest.mark.long
+def test_a_viewer_on_the_network_gets_every_frame(run: Path, demo_sequence: Path, tmp_path: Path):
+    chunk = pytest.importorskip("rerun.chunk")
+    port = free_port()
+    command = [sys.executable, "-m", "rerun", "--save", str(tmp_path / "got.rrd"), "--port", str(port)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as viewer:
+        assert viewer.stderr is not None
+        assert any("Listening" in line for line in iter(viewer.stderr.readline, ""))
+        words = ("--frontend", "klt", "--frames", str(FRAMES), "--viewer", f"rerun+http://127.0.0.1:{port}/proxy")
+        done = run_here("track", demo_sequence, "--out", tmp_path / "run", *words)
+        viewer.terminate()
+    assert done.returncode == 0, done.stderr
+    chunks = list(chunk.RrdReader(tmp_path / "got.rrd").stream().to_chunks())
+    assert sum(each.num_rows for each in chunks if each.entity_path == "/world/camera") == FRAMES
+    assert (tmp_path / "run" / "trajectory.tum").read_bytes() == (run / "trajectory.tum").read_bytes()
+
+
+def test_a_viewer_that_does_not_answer_is_named_before_anything_is_tracked(demo_sequence: Path, tmp_path: Path):
+    pytest.importorskip("rerun")
+    url = f"rerun+http://127.0.0.1:{free_port()}/proxy"
+    done = run_here("track", demo_sequence, "--out", tmp_path / "run", "--viewer", url)
+    assert_refused(done, url, "start `rerun` there")
+    assert not (tmp_path / "run").exists()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+@pytest.mark.parametrize("viewer", ["rviz", "rerun:", "rerun:there.mp4", "rerun+http:9876", "http://127.0.0.1:9876"])
 def test_what_is_no_viewer_is_refused(demo_sequence: Path, tmp_path: Path, viewer: str):
     pytest.importorskip("rerun")
     done = run_here("track", demo_sequence, "--out", tmp_path / "run", "--frames", "2", "--viewer", viewer)

@@ -12,7 +12,7 @@ from sigmaslam.bodies.object_tracker import ObjectEstimate
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.se3 import se3_exp
-from sigmaslam.live.frame_drawing import STATUS_COLOURS, FramePainter
+from sigmaslam.live.frame_drawing import STATUS_COLOURS, FramePainter, Plan
 from sigmaslam.live.frame_sink import ThreadedSink, TrackedFrame, check_sink_path
 from sigmaslam.live.keyframe_points import KeyframePoints
 from sigmaslam.live.video import VideoSink, count_frames, frame_rate
@@ -67,14 +67,14 @@ def test_the_video_of_a_run_has_its_frames_and_its_rate(sequence: Path, tmp_path
 @pytest.mark.long
 @pytest.mark.usefixtures("without_report")
 def test_a_video_that_fails_leaves_a_whole_run(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    drawn = FramePainter.draw
+    taken = FramePainter.add
 
-    def draw(self: FramePainter, frame: TrackedFrame) -> np.ndarray:
+    def add(self: FramePainter, frame: TrackedFrame) -> None:
         if frame.number == FRAMES - 2:
             raise RuntimeError("no more paint")
-        return drawn(self, frame)
+        taken(self, frame)
 
-    monkeypatch.setattr(FramePainter, "draw", draw)
+    monkeypatch.setattr(FramePainter, "add", add)
     video = tmp_path / "video.mp4"
     done = run_here("track", sequence, "--out", tmp_path / "run", "--frontend", "klt", "--video", video)
     assert done.returncode == 2
@@ -101,7 +101,8 @@ def test_the_path_turns_on_the_panel_as_it_does_from_above(camera: StereoCamera)
     poses = [se3_exp(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])) for z in np.linspace(0, 10, 11)]
     poses += [se3_exp(np.array([x, 0.0, 10.0, 0.0, 0.0, 0.0])) for x in np.linspace(1, 10, 10)]
     for number, pose in enumerate(poses):
-        picture = painter.draw(frame_at(number, pose, "tracking" if number < 11 else "lost"))
+        painter.add(frame_at(number, pose, "tracking" if number < 11 else "lost"))
+    picture = painter.draw()
     assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
     panel = picture[:370, picture.shape[1] - picture.shape[0] :].astype(int)  # above the words
     tracked, lost = (
@@ -114,11 +115,30 @@ def test_the_path_turns_on_the_panel_as_it_does_from_above(camera: StereoCamera)
 
 
 def test_frames_without_a_pose_and_bodies_are_drawn(camera: StereoCamera):
-    painter = FramePainter(camera)
     unknown = frame_at(0, np.full((4, 4), np.nan), "starting")
-    sizes = {painter.draw(unknown).shape, painter.draw(frame_at(1, np.eye(4))).shape}
     body = TrackedFrame(2, ObjectEstimate(frame_at(2, np.eye(4)).result.camera), unknown.seen)
-    assert sizes == {painter.draw(body).shape}
+    painter, shapes = FramePainter(camera), set()
+    for frame in (unknown, frame_at(1, np.eye(4)), body):
+        painter.add(frame)
+        shapes.add(painter.draw().shape)
+    assert len(shapes) == 1
+
+
+def test_the_plan_of_a_long_run_is_thinned_and_ends_at_the_newest_pose(
+    camera: StereoCamera, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("sigmaslam.live.frame_drawing._MOST_POSES", 11)
+    plan = Plan(KeyframePoints(camera))
+    for number in range(100):
+        pose = np.eye(4)
+        pose[2, 3] = number
+        plan.add(frame_at(number, pose))
+        depths = [each[1] for each in plan._path]
+        assert len(depths) == len(plan._status) <= 11
+        assert (depths[0], depths[-1]) == (0, number)
+        steps = np.diff(depths)
+        assert len(set(steps[:-1])) <= 1
+        assert number < 10 or len(depths) > 5
 
 
 def test_points_of_keyframes_are_where_they_were_seen_and_shown_once(camera: StereoCamera):

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sigmaslam import source_commit
+from sigmaslam_benchmarks import source_description
+from sigmaslam_training import source_commit
 
-SOURCE = Path(source_commit.__file__)
+SOURCES = Path(source_commit.__file__), Path(source_description.__file__)
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -21,10 +22,11 @@ def git(folder: Path, *arguments: str) -> str:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A repository of the one module, a page and a file of code beside."""
+    """A repository of the two modules, a page and a file of code beside."""
     (tmp_path / "package").mkdir()
     (tmp_path / "docs").mkdir()
-    shutil.copy(SOURCE, tmp_path / "package" / "source_commit.py")
+    for source in SOURCES:
+        shutil.copy(source, tmp_path / "package")
     for name in ("docs/page.md", "README.md", "code.py"):
         (tmp_path / name).write_text("first\n")
     git(tmp_path, "init", "--quiet")
@@ -34,8 +36,11 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def described(folder: Path) -> str:
-    """What the module says where it lies in this folder."""
-    code = "from source_commit import describe_source; print(describe_source())"
+    """What the modules say where they lie in this folder."""
+    code = (
+        "import sys, source_commit; sys.modules['sigmaslam_training.source_commit'] = source_commit; "
+        "from source_description import describe_source; print(describe_source())"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
@@ -57,11 +62,12 @@ def test_without_a_checkout_the_version_is_told_even_inside_another_repository(c
     """As of a package in a virtual environment that lies in some checkout and is ignored there."""
     inner = checkout / ".venv"
     inner.mkdir()
-    shutil.copy(SOURCE, inner / "source_commit.py")
+    for source in SOURCES:
+        shutil.copy(source, inner)
     assert described(inner) == f"of version {version('sigmaslam')}"
 
 
 def test_a_description_stays_what_it_was(monkeypatch: pytest.MonkeyPatch):
-    first = source_commit.describe_source()
-    monkeypatch.setattr(source_commit, "current_commit", lambda: "0" * 40)
-    assert source_commit.describe_source() == first
+    first = source_description.describe_source()
+    monkeypatch.setattr(source_description, "current_commit", lambda: "0" * 40)
+    assert source_description.describe_source() == first
