@@ -94,17 +94,12 @@ class StereoBody:
 
     def motion(self, path: Tensor, duration: Tensor) -> MotionModel:
         """A step's motion; its inputs are the path (..., 12) of `StereoRecording.steps` and the duration (..., 1)."""
-        spread = []
-        for (of_time, of_way), way, change in zip(
-            (self.noise.drive, self.noise.turn),
-            (path[..., :3], path[..., 3:6]),
-            (path[..., 6:9], path[..., 9:]),
-            strict=True,
-        ):
-            length = way.square().sum(dim=-1, keepdim=True).sqrt()
-            # Between its samples a rate is a Brownian bridge, whose area has this variance.
-            spread.append(of_time**2 * duration[..., None] + of_way**2 * length + change.square() / 12.0)
-        return MotionModel(_move, Diagonal(torch.cat(spread, dim=-1)), additive=False)
+        of_time, of_way = path.new_tensor([self.noise.drive, self.noise.turn]).square().unbind(dim=-1)
+        length = path[..., :6].unflatten(-1, (2, 3)).square().sum(dim=-1).sqrt()
+        spread = (of_time * duration[..., None] + of_way * length).repeat_interleave(3, dim=-1)
+        # Between its samples a rate is a Brownian bridge, whose area has this variance.
+        spread = spread + path[..., 6:].square() / 12.0
+        return MotionModel(_move, Diagonal(spread), additive=False)
 
     def measurement(self) -> MeasurementModel:
         """Pixels (u_left, v_left, u_right, v_right) of one point (..., 3), of unit noise."""
@@ -118,8 +113,7 @@ class StereoBody:
         rig = self.rig
         R_world_body = BODY.to_matrix(state[..., :7])[..., :3, :3]
         in_body = (R_world_body.mT @ (point - state[..., :3])[..., None])[..., 0] - rig.camera_in_body
-        in_camera = (rig.R_camera_body @ in_body[..., None])[..., 0]
-        x, y, z = in_camera.unbind(-1)
+        x, y, z = (rig.R_camera_body @ in_body[..., None])[..., 0].unbind(-1)
         inverse = 1.0 / z.clamp_min(NEAREST)
         row = rig.fy * y * inverse + rig.cy
         left = rig.fx * x * inverse + rig.cx
