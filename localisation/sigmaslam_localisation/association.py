@@ -19,9 +19,9 @@ from sigmaslam_localisation.localise import FilterName, make_filter
 from sigmaslam_localisation.mapping_robot import MappingRobot
 from sigmaslam_localisation.recording import Recording
 from sigmaslam_localisation.robot_step import RobotStep
-from sigmaslam_localisation.robots import DELAYS, first_poses
+from sigmaslam_localisation.robots import first_poses
 from sigmaslam_localisation.sighting_noise import repetition
-from sigmaslam_localisation.steps import Steps, make_steps
+from sigmaslam_localisation.steps import DELAYS, Steps, make_steps
 from sigmaslam_localisation.wheeled_robot import SPACE, WheeledRobot
 
 COMPATIBLE = 0.999

@@ -20,7 +20,7 @@ from sigmaslam_localisation.localisation_page import draw_axes, write_page
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
 from sigmaslam_localisation.output import write_lines
 from sigmaslam_localisation.starry import StereoRecording
-from sigmaslam_localisation.steps import Steps
+from sigmaslam_localisation.steps import DELAYS, Steps
 from sigmaslam_localisation.stereo_points import BODY, CONSTANTS, SPACE, StereoBody
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ class BodyEstimate:
         nis: (K, L) of each point, of four degrees of freedom; NaN for none.
         weight: (K, L) by robust weights.
         scale: (4,) standard deviation of the pixels over the nominal one, at the end.
+        delay: seconds by which the gyroscopes follow the body.
         truth: (K + 1, 7), or None.
         smoothed, lagged: the same given what was seen later: all of it, or with a fixed lag; None if not asked for.
     """
@@ -56,6 +57,7 @@ class BodyEstimate:
     nis: np.ndarray
     weight: np.ndarray
     scale: np.ndarray
+    delay: float
     truth: np.ndarray | None
     smoothed: BodyEstimate | None = None
     lagged: BodyEstimate | None = None
@@ -67,7 +69,7 @@ def localise_body(
     tell: Callable[[str], None] = lambda _: None,
     lag: float | None = None,
 ) -> tuple[BodyEstimate, BodyEstimate]:
-    """The body's poses, in two passes as those of `localise_robots`: the second begins with the first's constants.
+    """The body's poses, in two passes as those of `localise_robots`: delay and constants are the first's.
 
     With a lag in seconds the second pass is smoothed as well.
 
@@ -76,54 +78,67 @@ def localise_body(
     """
     if recording.truth is None:
         raise InputError(f"{recording.name}: has no true pose to start from: add theta_vk_i and r_i_vk_i")
-    body, steps, bayes = StereoBody(recording.rig), recording.steps, make_filter(filter_name, SPACE)
+    body, bayes = StereoBody(recording.rig), make_filter(filter_name, SPACE)
     prior = body.prior(torch.from_numpy(recording.truth[:1]))
-    first = localise(bayes, body, prior, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
+    steps = recording.steps(DELAYS)
+    repeated = Gaussian(prior.mean.repeat(len(DELAYS), 1), prior.covariance.repeat(len(DELAYS), 1, 1))
+    first = localise(bayes, body, repeated, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
+    best = int(first.log_likelihood.argmax())
+    delay = DELAYS[best]
+    at_first = _estimate(recording, body, delay, steps, first, best)
     mean, covariance_of_prior = prior.mean.clone(), prior.covariance.clone()
     # A point has one number more than its tangent.
-    mean[:, CONSTANTS.start + 1 : CONSTANTS.stop + 1] = first.final.mean[:, CONSTANTS.start + 1 : CONSTANTS.stop + 1]
-    covariance_of_prior[:, CONSTANTS, CONSTANTS] = first.final.covariance[:, CONSTANTS, CONSTANTS]
+    mean[0, CONSTANTS.start + 1 :] = first.final.mean[best, CONSTANTS.start + 1 :]
+    covariance_of_prior[0, CONSTANTS, CONSTANTS] = first.final.covariance[best, CONSTANTS, CONSTANTS]
     prior = Gaussian(mean, covariance_of_prior)
-    scale = torch.from_numpy(first.scale[-1])
+    scale, steps = torch.from_numpy(first.scale[-1, best : best + 1]), recording.steps([delay])
     result = localise(
         bayes, body, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"), smoothing=lag is not None
     )
-    estimate = _estimate(recording, steps, result)
+    estimate = _estimate(recording, body, delay, steps, result, 0)
     if lag is not None:
         tell("smoothing")
         (smoother,) = result.smoothers
         whole, lagged = (
-            replace(estimate, pose=mean[:, :7], covariance=covariance[:, :6, :6], belief=_belief(covariance))
-            for mean, covariance in (smoother.smooth(), smoother.smooth(estimate.seconds, lag))
+            _with_poses(estimate, body, *smoothed)
+            for smoothed in (smoother.smooth(), smoother.smooth(estimate.seconds, lag))
         )
         estimate = replace(estimate, smoothed=whole, lagged=lagged)
-    return _estimate(recording, steps, first), estimate
+    return at_first, estimate
 
 
-def _belief(covariance: np.ndarray) -> np.ndarray:
-    return degree_of_belief(torch.from_numpy(np.ascontiguousarray(covariance[:, :3, :3]))).numpy()
+def _with_poses(estimate: BodyEstimate, body: StereoBody, mean: np.ndarray, covariance: np.ndarray) -> BodyEstimate:
+    """The estimate with the poses of states (K + 1, 17), whose covariance (K + 1, 16, 16) knows no mounting."""
+    spread = covariance[:, :6, :6] + np.diag(np.repeat(np.square(body.noise.mounting), 3))
+    belief = degree_of_belief(torch.from_numpy(np.ascontiguousarray(spread[:, :3, :3]))).numpy()
+    return replace(estimate, pose=mean[:, :7], covariance=spread, belief=belief)
 
 
-def _estimate(recording: StereoRecording, steps: Steps, result: Localisation) -> BodyEstimate:
-    covariance = result.covariance[:, 0, :6, :6]
-    nis = result.nis[:, 0]
-    return BodyEstimate(
-        steps.seconds[:, 0],
-        result.mean[:, 0, :7],
-        covariance,
-        _belief(covariance),
+def _estimate(
+    recording: StereoRecording, body: StereoBody, delay: float, steps: Steps, result: Localisation, index: int
+) -> BodyEstimate:
+    """Of the member of the batch with that index."""
+    nis, nothing = result.nis[:, index], np.empty(0)
+    estimate = BodyEstimate(
+        steps.seconds[:, index],
+        nothing,
+        nothing,
+        nothing,
         np.append(0, np.isfinite(nis).sum(axis=1)),
         nis,
-        result.weight[:, 0],
-        np.sqrt(result.scale[-1, 0]),
+        result.weight[:, index],
+        np.sqrt(result.scale[-1, index]),
+        delay,
         recording.truth,
     )
+    return _with_poses(estimate, body, result.mean[:, index], result.covariance[:, index])
 
 
 def score_body(estimate: BodyEstimate) -> dict[str, float]:
     """Root mean square errors over all steps, NEES of six degrees of freedom, NIS of the points."""
     there = np.isfinite(estimate.nis)
     scores = {
+        "delay": estimate.delay,
         "points_seen": int(there.sum()),
         "nis_per_dof": float(estimate.nis[there].mean() / 4),
         "nis_per_dof_median": float(np.median(estimate.nis[there]) / 4),

@@ -99,7 +99,7 @@ def localise(
         new = present & torch.from_numpy(steps.since).isinf()
         present, position = present & ~new, landmark[..., None]
     seen = torch.where(present[..., None], value, torch.nan)
-    growth = repetition(torch.from_numpy(steps.since))
+    growth = repetition(torch.from_numpy(steps.since), steps.correlation)
     nominal = platform.variance(value)
     robot = RobotStep(bayes, platform, L)
     start = torch.ones(B, m, dtype=torch.float64) if scale is None else scale

@@ -16,11 +16,8 @@ from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot
 from sigmaslam_localisation.recording import PlanarTruth, Recording
 from sigmaslam_localisation.robot_step import Platform
 from sigmaslam_localisation.smoothing import Smoother
-from sigmaslam_localisation.steps import Steps, make_steps
+from sigmaslam_localisation.steps import DELAYS, Steps, make_steps
 from sigmaslam_localisation.wheeled_robot import BODY, CONSTANTS, SPACE, WheeledRobot
-
-DELAYS = (0.0, 0.1, 0.2, 0.3, 0.4)
-"""Seconds by which a robot may follow its commands, or sightings its odometry; the most likely one is taken."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

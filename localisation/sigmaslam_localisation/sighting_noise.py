@@ -15,7 +15,7 @@ LEARNING_RATE = 0.02
 """Share of what is known about the size of the noise that one new sighting replaces: about 50 count."""
 
 
-def repetition(since: Tensor) -> Tensor:
+def repetition(since: Tensor, correlation: float = CORRELATION_SECONDS) -> Tensor:
     """By how much the variance of a sighting grows because the landmark was seen shortly before, (...,).
 
     Of errors that a first-order Markov process makes, n at a spacing with correlation rho tell as much as
@@ -23,8 +23,9 @@ def repetition(since: Tensor) -> Tensor:
 
     Args:
         since: (...,) seconds since the sighting before; infinite for none.
+        correlation: the process's time constant, seconds.
     """
-    rho = torch.exp(-since.clamp_min(1e-3) / CORRELATION_SECONDS)
+    rho = torch.exp(-since.clamp_min(1e-3) / correlation)
     return (1.0 + rho) / (1.0 - rho)
 
 

@@ -6,6 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam_localisation.recording import Recording
+from sigmaslam_localisation.sighting_noise import CORRELATION_SECONDS
+
+DELAYS = (0.0, 0.1, 0.2, 0.3, 0.4)
+"""Seconds by which a robot may follow its commands, sightings its odometry, or gyroscopes their body."""
 
 LONGEST_STEP = 0.2
 """Seconds. Within a step the robot is taken to drive an arc."""
@@ -19,11 +23,12 @@ class Steps:
         count: (B,) steps of each robot.
         seconds: (K + 1, B) times: the start, then the end of each step.
         duration: (K, B) seconds.
-        path: (K, B, 2) what the controls say: metres driven and radians turned.
+        path: (K, B, 2) what the controls say: metres driven and radians turned. Of a body: see `StereoRecording.steps`.
         value: (K, B, L, m) what was seen at the end of the step; NaN for none.
         landmark: (K, B, L) index of the landmark that was seen.
         position: (K, B, L, d) where it is, metres.
         since: (K, B, L) seconds since the same landmark was seen before; infinite the first time.
+        correlation: seconds after which the errors of a landmark's sightings are no longer alike.
     """
 
     count: np.ndarray
@@ -34,6 +39,7 @@ class Steps:
     landmark: np.ndarray
     position: np.ndarray
     since: np.ndarray
+    correlation: float = CORRELATION_SECONDS
 
 
 def make_steps(recordings: Sequence[Recording], delays: Sequence[float]) -> Steps:

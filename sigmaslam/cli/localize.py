@@ -92,7 +92,7 @@ def localize(
                 raise InputError(f"{path}: the filter {name} cannot go on: {error}") from error
             rows += [(name, each, summary) for each, summary in summaries.items()]
     _print_rows(rows)
-    if any(summary.get("nis_per_dof", 0.0) > _MOST_NIS for _, _, summary in rows):
+    if any(summary.get("nis_per_dof_median", 0.0) > _MOST_NIS for _, _, summary in rows):
         typer.echo("sightings contradict controls, start or map: are all in seconds, metres, radians, one world?")
     if compare:
         shown = _shown(rows)
@@ -151,7 +151,7 @@ def _parse_pose(text: str) -> _Pose:
     return x, y, heading
 
 
-# Noise is learned from the innovations, so theirs is one where models fit.
+# Noise is learned from the innovations, so theirs is one where models fit; of the median, as outliers decide a mean.
 _MOST_NIS = 3.0
 _Row = tuple[str, str, dict[str, Any]]
 """Filter, robot and summary."""
