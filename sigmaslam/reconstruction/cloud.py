@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -161,39 +162,32 @@ class VoxelCloud:
 
     Args:
         size: of the finest voxel, metres.
-        most: voxels in memory, of 120 bytes; up to as many points wait to be merged.
+        most: voxels in memory, of 120 bytes.
     """
 
     def __init__(self, size: float, most: int = 1_000_000) -> None:
         self.size = size
         self._most, self._folder, self._written = most, TemporaryDirectory(), list[Path]()
-        self._merged: tuple[np.ndarray, np.ndarray] = np.zeros((0, 4), np.int64), np.zeros((0, 11))
-        self._pending: list[tuple[np.ndarray, np.ndarray]] = []
+        self._voxels = self._empty()
+
+    def _empty(self) -> Any:
+        return (Voxels if kernels is None else kernels.Voxels)(self.size, _SIGMA_SHARE, _MOST_LEVEL)
 
     def add(self, cloud: DenseCloud, sigma: np.ndarray) -> None:
         """Takes the points of a keyframe, and their sigmas (N,) without the pose's, metres."""
-        if not len(cloud):
-            return
-        information = inverse(cloud.covariances.astype(np.float64))
-        weighted = _times(information, cloud.points)
-        sums = np.column_stack([information, weighted, cloud.intensity * cloud.views, cloud.views])
-        self._pending.append((_voxels(cloud.points, sigma, self.size), sums))
-        # Amortised: each point is sorted about as many times as the cloud triples.
-        if sum(len(part[0]) for part in self._pending) > min(2 * len(self._merged[0]), self._most):
-            self._merge()
-            if len(self._merged[0]) > self._most:
-                self._written.append(Path(self._folder.name) / f"{len(self._written)}.npz")
-                np.savez(self._written[-1], *self._merged)
-                self._merged = self._merged[0][:0], self._merged[1][:0]
+        self._voxels.add(cloud.points, cloud.covariances, sigma, cloud.intensity, cloud.views)
+        if len(self._voxels) > self._most:
+            self._written.append(Path(self._folder.name) / f"{len(self._written)}.npz")
+            np.savez(self._written[-1], *self._voxels.rows())
+            self._voxels = self._empty()
 
     def cloud(self, min_views: int = 1) -> DenseCloud:
         """The points that so many keyframes gave, or more, without those in whose voxels there are finer ones."""
         for path in self._written:
             with np.load(path) as parts:
-                self._pending.append((parts["arr_0"], parts["arr_1"]))
+                self._voxels.merge(parts["arr_0"], parts["arr_1"])
         self._written = []
-        self._merge()
-        keys, sums = self._merged
+        keys, sums = self._voxels.rows()
         seen = sums[:, 10] >= min_views
         keys, sums = keys[seen], sums[seen]
         information, count = sums[:, :6], sums[:, 10]
@@ -211,10 +205,36 @@ class VoxelCloud:
             count.astype(np.int32),
         ).select(finest)
 
-    def _merge(self) -> None:
-        parts = [self._merged, *self._pending]
-        keys, sums = (np.concatenate([part[k] for part in parts]) for k in range(2))
-        self._merged, self._pending = _sum_by_key(keys, sums), []
+
+class Voxels:
+    """Sums of what falls into each voxel: the twin of the compiled class.
+
+    Args:
+        size: of the finest voxel, metres.
+        share: of a point's sigma that its voxel's side must have.
+        most_level: how often a side is doubled at the most.
+    """
+
+    def __init__(self, size: float, share: float, most_level: int) -> None:
+        assert (share, most_level) == (_SIGMA_SHARE, _MOST_LEVEL)
+        self._size, self._rows = size, (np.zeros((0, 4), np.int64), np.zeros((0, 11)))
+
+    def __len__(self) -> int:
+        return len(self._rows[0])
+
+    def add(self, points: np.ndarray, covariances: np.ndarray, sigma: np.ndarray, *grey_and_views: np.ndarray) -> None:
+        """Takes points (N, 3), covariances (N, 6), sigmas without the pose's, grey values and views (N,)."""
+        information, (grey, views) = inverse(covariances.astype(np.float64)), grey_and_views
+        sums = np.column_stack([information, _times(information, points), grey * views, views])
+        self.merge(_voxels(points, sigma, self._size), sums)
+
+    def merge(self, keys: np.ndarray, sums: np.ndarray) -> None:
+        """Takes rows as `rows` gives them."""
+        self._rows = _sum_by_key(np.concatenate([self._rows[0], keys]), np.concatenate([self._rows[1], sums]))
+
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Voxels (M, 4), and the sums (M, 11) of information, that times points, grey values and views."""
+        return self._rows
 
 
 def _voxels(points: np.ndarray, sigma: np.ndarray, size: float) -> np.ndarray:

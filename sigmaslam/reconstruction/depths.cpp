@@ -149,6 +149,120 @@ py::tuple gauss_newton(const Reals& reference, const Reals& warped, const Reals&
     return py::make_tuple(moved, bound);
 }
 
+// The next lower whole number; without SSE4.1 std::floor is a call.
+INLINE int64_t whole(double value) {
+    const auto cut = static_cast<int64_t>(value);
+    return cut - (static_cast<double>(cut) > value);
+}
+
+// Packed coordinates and level, as `_ONE_KEY` of cloud.py packs them.
+int64_t packed(const int64_t* cell) {
+    return cell[0] + cell[1] * (int64_t{1} << 19) + cell[2] * (int64_t{1} << 38) + cell[3] * (int64_t{1} << 57);
+}
+
+// Numbers of different keys, counted from zero in the order in which they come.
+class Numbers {
+public:
+    explicit Numbers(size_t expected = 16) { resize(expected); }
+    // The number of a key, and whether it is new.
+    std::pair<size_t, bool> find(int64_t key) {
+        if (2 * keys.size() >= slots.size()) resize(2 * slots.size());
+        const size_t slot = place(key);
+        if (slots[slot]) return {slots[slot] - 1, false};
+        keys.push_back(key);
+        slots[slot] = static_cast<uint32_t>(keys.size());
+        return {keys.size() - 1, true};
+    }
+    std::vector<int64_t> keys;
+
+private:
+    size_t place(int64_t key) const {
+        size_t slot = (static_cast<uint64_t>(key) * 0x9e3779b97f4a7c15u) >> 20 & (slots.size() - 1);
+        while (slots[slot] && keys[slots[slot] - 1] != key) slot = (slot + 1) & (slots.size() - 1);
+        return slot;
+    }
+    void resize(size_t expected) {
+        size_t size = 64;
+        while (size < 2 * expected) size *= 2;
+        slots.assign(size, 0);
+        for (size_t k = 0; k < keys.size(); ++k) slots[place(keys[k])] = static_cast<uint32_t>(k + 1);
+    }
+    std::vector<uint32_t> slots;  // counted from one
+};
+
+// The rows of `VoxelCloud`: cells, and sums of what falls into them.
+class Voxels {
+public:
+    Voxels(double size, double sigma_share, int most_level) : share_(sigma_share), most_(most_level) {
+        for (int level = 0; level <= most_level; ++level) sides_.push_back(std::ldexp(size, level));
+    }
+
+    // Points (N, 3) with covariances (N, 6), sigmas without the pose's, grey values and views (N,).
+    void add(const Doubles& points, const Doubles& covariances, const Doubles& sigma, const Doubles& grey, const Doubles& views) {
+        const py::ssize_t n = sigma.size();
+        check(points.size() == 3 * n && covariances.size() == 6 * n && grey.size() == n && views.size() == n,
+              "all arrays must have a row for each point");
+        for (py::ssize_t k = 0; k < n; ++k) {
+            const double *p = points.data() + 3 * k, *c = covariances.data() + 6 * k;
+            int64_t cell[4] = {0, 0, 0, 0};
+            while (cell[3] < most_ && sides_[cell[3]] < share_ * sigma.data()[k]) ++cell[3];
+            const double scale = 1.0 / sides_[cell[3]];
+            for (int axis = 0; axis < 3; ++axis) cell[axis] = whole(p[axis] * scale);
+            // xx, xy, xz, yy, yz, zz of the inverse, from its cofactors.
+            double sums[11] = {c[3] * c[5] - c[4] * c[4], c[2] * c[4] - c[1] * c[5], c[1] * c[4] - c[2] * c[3],
+                               c[0] * c[5] - c[2] * c[2], c[1] * c[2] - c[0] * c[4], c[0] * c[3] - c[1] * c[1]};
+            const double determinant = c[0] * sums[0] + c[1] * sums[1] + c[2] * sums[2];
+            for (int i = 0; i < 6; ++i) sums[i] /= determinant;
+            sums[6] = sums[0] * p[0] + sums[1] * p[1] + sums[2] * p[2];
+            sums[7] = sums[1] * p[0] + sums[3] * p[1] + sums[4] * p[2];
+            sums[8] = sums[2] * p[0] + sums[4] * p[1] + sums[5] * p[2];
+            sums[9] = grey.data()[k] * views.data()[k];
+            sums[10] = views.data()[k];
+            add_row(cell, sums);
+        }
+    }
+
+    // Rows as `rows` gives them.
+    void merge(const Rows& cells, const Doubles& sums) {
+        check(11 * cells.size() == 4 * sums.size(), "each cell must have its sums");
+        for (py::ssize_t k = 0; k < cells.size() / 4; ++k) add_row(cells.data() + 4 * k, sums.data() + 11 * k);
+    }
+
+    // Cells (M, 4) and sums (M, 11) by increasing packed cells.
+    py::tuple rows() const {
+        std::vector<size_t> order(count());
+        std::iota(order.begin(), order.end(), size_t{0});
+        std::sort(order.begin(), order.end(), [this](size_t a, size_t b) { return numbers_.keys[a] < numbers_.keys[b]; });
+        const auto n = static_cast<py::ssize_t>(count());
+        Rows cells({n, py::ssize_t{4}});
+        Doubles sums({n, py::ssize_t{11}});
+        for (py::ssize_t k = 0; k < n; ++k) {
+            std::copy_n(cells_.data() + 4 * order[k], 4, cells.mutable_data() + 4 * k);
+            std::copy_n(sums_.data() + 11 * order[k], 11, sums.mutable_data() + 11 * k);
+        }
+        return py::make_tuple(cells, sums);
+    }
+
+    size_t count() const { return numbers_.keys.size(); }
+
+private:
+    void add_row(const int64_t* cell, const double* sums) {
+        const auto [number, is_new] = numbers_.find(packed(cell));
+        if (is_new) {
+            cells_.insert(cells_.end(), cell, cell + 4);
+            sums_.insert(sums_.end(), sums, sums + 11);
+            return;
+        }
+        for (int i = 0; i < 11; ++i) sums_[11 * number + i] += sums[i];
+    }
+
+    double share_;
+    int most_;
+    std::vector<double> sides_, sums_;
+    std::vector<int64_t> cells_;
+    Numbers numbers_;
+};
+
 // Increasing numbers of the most certain pixel of each voxel, the first of equals: `DepthPixels.thinned`.
 Rows thin(const Rows& pixels, const Doubles& disparity, const Doubles& variance, const std::array<double, 5>& camera, double size,
           double sigma_share, int most_level) {
@@ -157,11 +271,8 @@ Rows thin(const Rows& pixels, const Doubles& disparity, const Doubles& variance,
     const auto [fx, fy, cx, cy, focal_baseline] = camera;
     std::vector<double> sides;
     for (int level = 0; level <= most_level; ++level) sides.push_back(std::ldexp(size, level));
-    size_t slots = 64;
-    while (slots < 2 * static_cast<size_t>(n)) slots *= 2;
-    // Of each slot the voxel that is there, counted from one, and of each voxel its key and its best pixel.
-    std::vector<uint32_t> table(slots);
-    std::vector<int64_t> keys, rows;
+    Numbers voxels(static_cast<size_t>(n) / 2);
+    std::vector<int64_t> rows;
     std::vector<double> least;
     for (py::ssize_t k = 0; k < n; ++k) {
         const double d = disparity.data()[k], z = focal_baseline / d, relative = variance.data()[k] / (d * d);
@@ -170,19 +281,14 @@ Rows thin(const Rows& pixels, const Doubles& disparity, const Doubles& variance,
         int level = 0;
         while (level < most_level && sides[level] < wanted) ++level;
         const double scale = 1.0 / sides[level];
-        int64_t key = static_cast<int64_t>(level) << 57;
-        key += static_cast<int64_t>(std::floor(x * scale)) + static_cast<int64_t>(std::floor(y * scale)) * (int64_t{1} << 19);
-        key += static_cast<int64_t>(std::floor(z * scale)) * (int64_t{1} << 38);
-        size_t slot = (static_cast<uint64_t>(key) * 0x9e3779b97f4a7c15u) >> 20 & (slots - 1);
-        while (table[slot] && keys[table[slot] - 1] != key) slot = (slot + 1) & (slots - 1);
-        if (!table[slot]) {
-            keys.push_back(key);
+        const int64_t cells[4] = {whole(x * scale), whole(y * scale), whole(z * scale), level};
+        const auto [number, is_new] = voxels.find(packed(cells));
+        if (is_new) {
             rows.push_back(k);
             least.push_back(relative);
-            table[slot] = static_cast<uint32_t>(keys.size());
-        } else if (relative < least[table[slot] - 1]) {
-            rows[table[slot] - 1] = k;
-            least[table[slot] - 1] = relative;
+        } else if (relative < least[number]) {
+            rows[number] = k;
+            least[number] = relative;
         }
     }
     std::sort(rows.begin(), rows.end());
@@ -198,4 +304,10 @@ PYBIND11_MODULE(_depths, module) {
     module.def("compare", &compare);
     module.def("gauss_newton", &gauss_newton);
     module.def("thin", &thin);
+    py::class_<Voxels>(module, "Voxels")
+        .def(py::init<double, double, int>())
+        .def("add", &Voxels::add)
+        .def("merge", &Voxels::merge)
+        .def("rows", &Voxels::rows)
+        .def("__len__", &Voxels::count);
 }
