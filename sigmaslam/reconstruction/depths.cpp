@@ -43,6 +43,11 @@ struct Limits {
     float prior_variance, widest_bound, rounding, most_gain, longest;
 };
 
+// Of a variance: what marks pixels without a disparity, limits of relief and edge, the floor, and factors.
+struct Spread {
+    float nowhere, same_surface, widest_edge, floor, by_bound, by_relief, by_edge;
+};
+
 #define FUNCTIONS "reconstruction/depths.inc"
 #include "../both_ways.inc"
 
@@ -51,6 +56,8 @@ const auto window_ratios = HAS_AVX2 ? wide::window_ratios : plain::window_ratios
 const auto find_agreeing = HAS_AVX2 ? wide::find_agreeing : plain::find_agreeing;
 const auto update_filters = HAS_AVX2 ? wide::update_filters : plain::update_filters;
 const auto align_windows = HAS_AVX2 ? wide::gauss_newton : plain::gauss_newton;
+const auto sum_variances = HAS_AVX2 ? wide::sum_variances : plain::sum_variances;
+const auto sample_planes = HAS_AVX2 ? wide::sample_planes : plain::sample_planes;
 const auto compare_pixels = HAS_AVX2 ? wide::compare : plain::compare;
 
 void check(bool right, const char* what) {
@@ -119,17 +126,43 @@ py::tuple update(const Rows& known, const Reals& seen, const std::vector<Reals>&
     return py::make_tuple(means, variances, costs, supports, contradicted);
 }
 
-// weight, difference, its square and the warped image (H, W) of an image and what another view shows of N pixels.
+// (H, W) variance of disparities, after alignment.
+Reals variance(const Reals& found, const Reals& departs, const Reals& smooth, const Reals& bound, const std::array<float, 7>& by) {
+    check(found.ndim() == 2 && found.shape(0) > RADIUS && found.shape(1) > RADIUS, "an image is too small");
+    for (const auto* each : {&departs, &smooth, &bound}) check(each->size() == found.size(), "images have one size");
+    Reals out({found.shape(0), found.shape(1)});
+    std::vector<float> rows(3 * (found.shape(1) + 2 * RADIUS + 8));
+    sum_variances(found.data(), departs.data(), smooth.data(), bound.data(), static_cast<int>(found.shape(0)),
+                  static_cast<int>(found.shape(1)), {by[0], by[1], by[2], by[3], by[4], by[5], by[6]}, rows.data(),
+                  out.mutable_data());
+    return out;
+}
+
+// (H, W, 4) disparity, its variance, and its slopes by u and v.
+Reals sample_view(const Reals& disparity, const Reals& variance) {
+    check(disparity.ndim() == 2 && variance.size() == disparity.size(), "images have one size");
+    const py::ssize_t height = disparity.shape(0), width = disparity.shape(1);
+    Reals out({height, width, py::ssize_t{4}});
+    std::vector<float> rows(5 * (width + 2 * RADIUS + 8));
+    sample_planes(disparity.data(), variance.data(), static_cast<int>(height), static_cast<int>(width), rows.data(),
+                  out.mutable_data());
+    return out;
+}
+
+// Means of weight, difference and its square, and the warped image (H, W), of an image and what another view shows of N
+// pixels.
 py::tuple compare(const Grey& image, const Rows& known, const Reals& grey) {
     check(image.ndim() == 2 && grey.size() == known.size(), "an image must be (H, W), and each pixel have a grey value");
+    check(image.shape(0) > RADIUS && image.shape(1) > RADIUS, "an image is too small");
     for (py::ssize_t k = 0; k < known.size(); ++k)
         check(known.data()[k] >= 0 && known.data()[k] < image.size(), "a pixel is in no image");
     const std::array<py::ssize_t, 2> shape = {image.shape(0), image.shape(1)};
     py::array_t<float> out[3] = {py::array_t<float>(shape), py::array_t<float>(shape), py::array_t<float>(shape)};
-    for (auto& each : out) std::fill(each.mutable_data(), each.mutable_data() + image.size(), 0.f);
     py::array_t<uint8_t> warped(shape);
     std::copy(image.data(), image.data() + image.size(), warped.mutable_data());
-    compare_pixels(image.data(), {known.data(), static_cast<size_t>(known.size())}, grey.data(), out[0].mutable_data(),
+    std::vector<float> there(image.size()), differs(image.size()), rows(3 * (shape[1] + 2 * RADIUS + 8));
+    compare_pixels(image.data(), {known.data(), static_cast<size_t>(known.size())}, grey.data(), static_cast<int>(shape[0]),
+                   static_cast<int>(shape[1]), there.data(), differs.data(), rows.data(), out[0].mutable_data(),
                    out[1].mutable_data(), out[2].mutable_data(), warped.mutable_data());
     return py::make_tuple(out[0], out[1], out[2], warped);
 }
@@ -301,6 +334,8 @@ PYBIND11_MODULE(_depths, module) {
     module.doc() = "Compiled twins of functions of sigmaslam.reconstruction.";
     module.def("measure", &measure);
     module.def("update", &update);
+    module.def("variance", &variance);
+    module.def("sample_view", &sample_view);
     module.def("compare", &compare);
     module.def("gauss_newton", &gauss_newton);
     module.def("thin", &thin);

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -65,7 +66,7 @@ class ReconstructionSummary:
     seconds_a_keyframe: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class KeyframeDepth:
     """The depths of one keyframe.
 
@@ -92,7 +93,7 @@ class KeyframeDepth:
         """(H, W) of the fused disparities, that of the offset included; pixels squared."""
         return np.asarray(self.fused.variance + np.float32(self.offset_sigma**2))
 
-    @property
+    @cached_property
     def is_point(self) -> np.ndarray:
         """(H, W) bool: confirmed, near enough to be certain, and among others that are."""
         certain = self.fused.is_confirmed & (self.variance < (_MAX_SIGMA * self.fused.disparity) ** 2)
