@@ -7,6 +7,7 @@ using Reals = Array<float>;
 using Doubles = Array<double>;
 using Grey = Array<uint8_t>;
 using Rows = Array<int64_t>;
+using Counts = Array<int32_t>;
 
 namespace {
 
@@ -188,111 +189,140 @@ INLINE int64_t whole(double value) {
     return cut - (static_cast<double>(cut) > value);
 }
 
-// Packed coordinates and level, as `_ONE_KEY` of cloud.py packs them.
-int64_t packed(const int64_t* cell) {
-    return cell[0] + cell[1] * (int64_t{1} << 19) + cell[2] * (int64_t{1} << 38) + cell[3] * (int64_t{1} << 57);
-}
+// Voxels of a size and those twice, four times ... as wide.
+struct Grid {
+    Grid(double size, double sigma_share, int most_level) : share(sigma_share), most(most_level) {
+        for (int level = 0; level <= most_level; ++level) sides.push_back(std::ldexp(size, level));
+    }
+    // How often the side is doubled for a point of such a sigma.
+    int level(double sigma) const {
+        int found = 0;
+        while (found < most && sides[found] < share * sigma) ++found;
+        return found;
+    }
+    // Packed coordinates and level, as `_ONE_KEY` of cloud.py packs them.
+    int64_t key(double x, double y, double z, int level) const {
+        const double scale = 1.0 / sides[level];
+        return whole(x * scale) + whole(y * scale) * (int64_t{1} << 19) + whole(z * scale) * (int64_t{1} << 38) +
+               level * (int64_t{1} << 57);
+    }
+    double share;
+    int most;
+    std::vector<double> sides;
+};
 
 // Numbers of different keys, counted from zero in the order in which they come.
 class Numbers {
 public:
     explicit Numbers(size_t expected = 16) { resize(expected); }
+
     // The number of a key, and whether it is new.
     std::pair<size_t, bool> find(int64_t key) {
-        if (2 * keys.size() >= slots.size()) resize(2 * slots.size());
+        if (2 * keys.size() >= slots_.size()) resize(2 * slots_.size());
         const size_t slot = place(key);
-        if (slots[slot]) return {slots[slot] - 1, false};
+        if (slots_[slot]) return {slots_[slot] - 1, false};
         keys.push_back(key);
-        slots[slot] = static_cast<uint32_t>(keys.size());
+        slots_[slot] = static_cast<uint32_t>(keys.size());
         return {keys.size() - 1, true};
     }
+    void prefetch(int64_t key) const { __builtin_prefetch(&slots_[start(key)]); }
     std::vector<int64_t> keys;
 
 private:
+    size_t start(int64_t key) const { return (static_cast<uint64_t>(key) * 0x9e3779b97f4a7c15u) >> 20 & (slots_.size() - 1); }
     size_t place(int64_t key) const {
-        size_t slot = (static_cast<uint64_t>(key) * 0x9e3779b97f4a7c15u) >> 20 & (slots.size() - 1);
-        while (slots[slot] && keys[slots[slot] - 1] != key) slot = (slot + 1) & (slots.size() - 1);
+        size_t slot = start(key);
+        while (slots_[slot] && keys[slots_[slot] - 1] != key) slot = (slot + 1) & (slots_.size() - 1);
         return slot;
     }
     void resize(size_t expected) {
         size_t size = 64;
         while (size < 2 * expected) size *= 2;
-        slots.assign(size, 0);
-        for (size_t k = 0; k < keys.size(); ++k) slots[place(keys[k])] = static_cast<uint32_t>(k + 1);
+        slots_.assign(size, 0);
+        for (size_t k = 0; k < keys.size(); ++k) slots_[place(keys[k])] = static_cast<uint32_t>(k + 1);
     }
-    std::vector<uint32_t> slots;  // counted from one
+    std::vector<uint32_t> slots_;  // counted from one
 };
 
-// The rows of `VoxelCloud`: cells, and sums of what falls into them.
+// Sums of what falls into each voxel, as the class of this name in cloud.py has them.
 class Voxels {
 public:
-    Voxels(double size, double sigma_share, int most_level) : share_(sigma_share), most_(most_level) {
-        for (int level = 0; level <= most_level; ++level) sides_.push_back(std::ldexp(size, level));
-    }
+    Voxels(double size, double sigma_share, int most_level) : grid_(size, sigma_share, most_level) {}
 
     // Points (N, 3) with covariances (N, 6), sigmas without the pose's, grey values and views (N,).
-    void add(const Doubles& points, const Doubles& covariances, const Doubles& sigma, const Doubles& grey, const Doubles& views) {
+    void add(const Doubles& points, const Reals& covariances, const Doubles& sigma, const Reals& grey, const Counts& views) {
         const py::ssize_t n = sigma.size();
         check(points.size() == 3 * n && covariances.size() == 6 * n && grey.size() == n && views.size() == n,
               "all arrays must have a row for each point");
+        constexpr py::ssize_t ahead = 16;  // rows whose slots are on their way from memory
+        std::vector<int64_t> keys(n);
+        std::vector<uint8_t> levels(n);
         for (py::ssize_t k = 0; k < n; ++k) {
-            const double *p = points.data() + 3 * k, *c = covariances.data() + 6 * k;
-            int64_t cell[4] = {0, 0, 0, 0};
-            while (cell[3] < most_ && sides_[cell[3]] < share_ * sigma.data()[k]) ++cell[3];
-            const double scale = 1.0 / sides_[cell[3]];
-            for (int axis = 0; axis < 3; ++axis) cell[axis] = whole(p[axis] * scale);
-            // xx, xy, xz, yy, yz, zz of the inverse, from its cofactors.
-            double sums[11] = {c[3] * c[5] - c[4] * c[4], c[2] * c[4] - c[1] * c[5], c[1] * c[4] - c[2] * c[3],
-                               c[0] * c[5] - c[2] * c[2], c[1] * c[2] - c[0] * c[4], c[0] * c[3] - c[1] * c[1]};
-            const double determinant = c[0] * sums[0] + c[1] * sums[1] + c[2] * sums[2];
+            const double* p = points.data() + 3 * k;
+            levels[k] = static_cast<uint8_t>(grid_.level(sigma.data()[k]));
+            keys[k] = grid_.key(p[0], p[1], p[2], levels[k]);
+        }
+        for (py::ssize_t k = 0; k < n; ++k) {
+            if (k + ahead < n) numbers_.prefetch(keys[k + ahead]);
+            const double* p = points.data() + 3 * k;
+            const float* six = covariances.data() + 6 * k;
+            const double xx = six[0], xy = six[1], xz = six[2], yy = six[3], yz = six[4], zz = six[5];
+            // The inverse, from its cofactors.
+            double sums[SUMS] = {yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
+                                 xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy};
+            const double determinant = xx * sums[0] + xy * sums[1] + xz * sums[2];
             for (int i = 0; i < 6; ++i) sums[i] /= determinant;
             sums[6] = sums[0] * p[0] + sums[1] * p[1] + sums[2] * p[2];
             sums[7] = sums[1] * p[0] + sums[3] * p[1] + sums[4] * p[2];
             sums[8] = sums[2] * p[0] + sums[4] * p[1] + sums[5] * p[2];
-            sums[9] = grey.data()[k] * views.data()[k];
+            sums[9] = static_cast<double>(grey.data()[k]) * views.data()[k];
             sums[10] = views.data()[k];
-            add_row(cell, sums);
+            add_row(keys[k], levels[k], sums);
         }
     }
 
     // Rows as `rows` gives them.
-    void merge(const Rows& cells, const Doubles& sums) {
-        check(11 * cells.size() == 4 * sums.size(), "each cell must have its sums");
-        for (py::ssize_t k = 0; k < cells.size() / 4; ++k) add_row(cells.data() + 4 * k, sums.data() + 11 * k);
+    void merge(const Rows& keys, const Grey& levels, const Doubles& sums) {
+        const py::ssize_t n = keys.size();
+        check(levels.size() == n && sums.size() == SUMS * n, "all arrays must have a row for each voxel");
+        for (py::ssize_t k = 0; k < n; ++k) add_row(keys.data()[k], levels.data()[k], sums.data() + SUMS * k);
     }
 
-    // Cells (M, 4) and sums (M, 11) by increasing packed cells.
-    py::tuple rows() const {
-        std::vector<size_t> order(count());
-        std::iota(order.begin(), order.end(), size_t{0});
-        std::sort(order.begin(), order.end(), [this](size_t a, size_t b) { return numbers_.keys[a] < numbers_.keys[b]; });
-        const auto n = static_cast<py::ssize_t>(count());
-        Rows cells({n, py::ssize_t{4}});
-        Doubles sums({n, py::ssize_t{11}});
+    // Packed voxels and their levels (M,), and sums (M, 11), of those that so many views or more gave.
+    py::tuple rows(double min_views) const {
+        std::vector<size_t> chosen;
+        for (size_t k = 0; k < count(); ++k)
+            if (sums_[SUMS * k + 10] >= min_views) chosen.push_back(k);
+        const auto n = static_cast<py::ssize_t>(chosen.size());
+        Rows keys(n);
+        Grey levels(n);
+        Doubles sums({n, py::ssize_t{SUMS}});
         for (py::ssize_t k = 0; k < n; ++k) {
-            std::copy_n(cells_.data() + 4 * order[k], 4, cells.mutable_data() + 4 * k);
-            std::copy_n(sums_.data() + 11 * order[k], 11, sums.mutable_data() + 11 * k);
+            keys.mutable_data()[k] = numbers_.keys[chosen[k]];
+            levels.mutable_data()[k] = levels_[chosen[k]];
+            std::copy_n(sums_.data() + SUMS * chosen[k], SUMS, sums.mutable_data() + SUMS * k);
         }
-        return py::make_tuple(cells, sums);
+        return py::make_tuple(keys, levels, sums);
     }
 
     size_t count() const { return numbers_.keys.size(); }
 
 private:
-    void add_row(const int64_t* cell, const double* sums) {
-        const auto [number, is_new] = numbers_.find(packed(cell));
+    static constexpr int SUMS = 11;
+
+    void add_row(int64_t key, uint8_t level, const double* sums) {
+        const auto [number, is_new] = numbers_.find(key);
         if (is_new) {
-            cells_.insert(cells_.end(), cell, cell + 4);
-            sums_.insert(sums_.end(), sums, sums + 11);
+            levels_.push_back(level);
+            sums_.insert(sums_.end(), sums, sums + SUMS);
             return;
         }
-        for (int i = 0; i < 11; ++i) sums_[11 * number + i] += sums[i];
+        for (int i = 0; i < SUMS; ++i) sums_[SUMS * number + i] += sums[i];
     }
 
-    double share_;
-    int most_;
-    std::vector<double> sides_, sums_;
-    std::vector<int64_t> cells_;
+    Grid grid_;
+    std::vector<double> sums_;
+    std::vector<uint8_t> levels_;
     Numbers numbers_;
 };
 
@@ -302,20 +332,15 @@ Rows thin(const Rows& pixels, const Doubles& disparity, const Doubles& variance,
     const py::ssize_t n = disparity.size();
     check(pixels.size() == 2 * n && variance.size() == n, "all arrays must have a number for each pixel");
     const auto [fx, fy, cx, cy, focal_baseline] = camera;
-    std::vector<double> sides;
-    for (int level = 0; level <= most_level; ++level) sides.push_back(std::ldexp(size, level));
+    const Grid grid(size, sigma_share, most_level);
     Numbers voxels(static_cast<size_t>(n) / 2);
     std::vector<int64_t> rows;
     std::vector<double> least;
     for (py::ssize_t k = 0; k < n; ++k) {
         const double d = disparity.data()[k], z = focal_baseline / d, relative = variance.data()[k] / (d * d);
         const double x = (pixels.data()[2 * k] - cx) * z / fx, y = (pixels.data()[2 * k + 1] - cy) * z / fy;
-        const double wanted = sigma_share * std::sqrt((x * x + y * y + z * z) * relative);
-        int level = 0;
-        while (level < most_level && sides[level] < wanted) ++level;
-        const double scale = 1.0 / sides[level];
-        const int64_t cells[4] = {whole(x * scale), whole(y * scale), whole(z * scale), level};
-        const auto [number, is_new] = voxels.find(packed(cells));
+        const int level = grid.level(std::sqrt((x * x + y * y + z * z) * relative));
+        const auto [number, is_new] = voxels.find(grid.key(x, y, z, level));
         if (is_new) {
             rows.push_back(k);
             least.push_back(relative);
