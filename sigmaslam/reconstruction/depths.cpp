@@ -3,6 +3,8 @@
 // No sum is contracted or reordered (-ffp-contract=off, no -ffast-math): the bits are the same on every run.
 #include "../compiled.hpp"
 
+#include <memory>
+
 using Reals = Array<float>;
 using Doubles = Array<double>;
 using Grey = Array<uint8_t>;
@@ -226,6 +228,8 @@ public:
         return {keys.size() - 1, true};
     }
     void prefetch(int64_t key) const { __builtin_prefetch(&slots_[start(key)]); }
+    // Likely that of a key, one of others or `none`.
+    size_t guess(int64_t key, size_t none) const { return slots_[start(key)] ? slots_[start(key)] - 1 : none; }
     std::vector<int64_t> keys;
 
 private:
@@ -254,7 +258,7 @@ public:
         const py::ssize_t n = sigma.size();
         check(points.size() == 3 * n && covariances.size() == 6 * n && grey.size() == n && views.size() == n,
               "all arrays must have a row for each point");
-        constexpr py::ssize_t ahead = 16;  // rows whose slots are on their way from memory
+        constexpr py::ssize_t ahead = 16;  // rows whose sums are on their way from memory, and twice as many slots
         std::vector<int64_t> keys(n);
         std::vector<uint8_t> levels(n);
         for (py::ssize_t k = 0; k < n; ++k) {
@@ -263,7 +267,12 @@ public:
             keys[k] = grid_.key(p[0], p[1], p[2], levels[k]);
         }
         for (py::ssize_t k = 0; k < n; ++k) {
-            if (k + ahead < n) numbers_.prefetch(keys[k + ahead]);
+            if (k + 2 * ahead < n) numbers_.prefetch(keys[k + 2 * ahead]);
+            if (k + ahead < n && count()) {
+                const size_t number = numbers_.guess(keys[k + ahead], 0);
+                __builtin_prefetch(&numbers_.keys[number]);
+                for (int line = 0; line < SUMS; line += 8) __builtin_prefetch(row(number) + line);
+            }
             const double* p = points.data() + 3 * k;
             const float* six = covariances.data() + 6 * k;
             const double xx = six[0], xy = six[1], xz = six[2], yy = six[3], yz = six[4], zz = six[5];
@@ -292,7 +301,7 @@ public:
     py::tuple rows(double min_views) const {
         std::vector<size_t> chosen;
         for (size_t k = 0; k < count(); ++k)
-            if (sums_[SUMS * k + 10] >= min_views) chosen.push_back(k);
+            if (row(k)[10] >= min_views) chosen.push_back(k);
         const auto n = static_cast<py::ssize_t>(chosen.size());
         Rows keys(n);
         Grey levels(n);
@@ -300,7 +309,7 @@ public:
         for (py::ssize_t k = 0; k < n; ++k) {
             keys.mutable_data()[k] = numbers_.keys[chosen[k]];
             levels.mutable_data()[k] = levels_[chosen[k]];
-            std::copy_n(sums_.data() + SUMS * chosen[k], SUMS, sums.mutable_data() + SUMS * k);
+            std::copy_n(row(chosen[k]), SUMS, sums.mutable_data() + SUMS * k);
         }
         return py::make_tuple(keys, levels, sums);
     }
@@ -309,19 +318,24 @@ public:
 
 private:
     static constexpr int SUMS = 11;
+    static constexpr size_t BLOCK = 1 << 14;  // rows that are allocated at once and never moved
+
+    double* row(size_t number) const { return blocks_[number / BLOCK].get() + SUMS * (number % BLOCK); }
 
     void add_row(int64_t key, uint8_t level, const double* sums) {
         const auto [number, is_new] = numbers_.find(key);
         if (is_new) {
             levels_.push_back(level);
-            sums_.insert(sums_.end(), sums, sums + SUMS);
+            if (number % BLOCK == 0) blocks_.emplace_back(new double[SUMS * BLOCK]);
+            std::copy_n(sums, SUMS, row(number));
             return;
         }
-        for (int i = 0; i < SUMS; ++i) sums_[SUMS * number + i] += sums[i];
+        double* to = row(number);
+        for (int i = 0; i < SUMS; ++i) to[i] += sums[i];
     }
 
     Grid grid_;
-    std::vector<double> sums_;
+    std::vector<std::unique_ptr<double[]>> blocks_;
     std::vector<uint8_t> levels_;
     Numbers numbers_;
 };
