@@ -231,7 +231,7 @@ class Voxels:
 
     def merge(self, *rows: np.ndarray) -> None:
         """Takes rows as `rows` gives them."""
-        keys, levels, sums = (np.concatenate(each) for each in zip(self._rows, rows, strict=True))
+        keys, levels, sums = (np.concatenate([self._rows[k], rows[k]]) for k in range(3))
         order, first = _groups(keys)
         total = np.add.reduceat(sums[order], first) if len(keys) else sums
         self._rows = keys[order[first]], levels[order[first]], total

@@ -126,7 +126,7 @@ def reconstruct_run(
         mesh: PLY file of a mesh; needs Open3D.
         moved_to: where the run's input is, if it has moved.
         network: ONNX file of a stereo network in place of semi-global matching.
-        voxel: side of the finest voxels that points are merged in, metres; None: three pixels at the median depth.
+        voxel: side of the finest voxels that points are merged in, metres; None: two pixels at the median depth.
         max_sigma: points with a larger sigma are left out, metres; None: with one of a twentieth of their distance.
         min_views: keyframes that must have given a point.
         every: of so many keyframes one is used.
