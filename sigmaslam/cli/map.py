@@ -29,7 +29,7 @@ def reconstruct(
         typer.Option(
             min=1e-6,
             help="Side of the finest voxels that points are merged in, metres; doubled up to a point's sigma.",
-            show_default="3 pixels at the median",
+            show_default="2 pixels at the median",
         ),
     ] = None,
     max_sigma: Annotated[

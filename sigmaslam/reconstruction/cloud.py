@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -161,49 +162,42 @@ class VoxelCloud:
 
     Args:
         size: of the finest voxel, metres.
-        most: voxels in memory, of 120 bytes; up to as many points wait to be merged.
+        most: voxels in memory, of 110 bytes.
     """
 
-    def __init__(self, size: float, most: int = 1_000_000) -> None:
+    def __init__(self, size: float, most: int = 2_000_000) -> None:
         self.size = size
         self._most, self._folder, self._written = most, TemporaryDirectory(), list[Path]()
-        self._merged: tuple[np.ndarray, np.ndarray] = np.zeros((0, 4), np.int64), np.zeros((0, 11))
-        self._pending: list[tuple[np.ndarray, np.ndarray]] = []
+        self._voxels = self._empty()
+
+    def _empty(self) -> Any:
+        return (Voxels if kernels is None else kernels.Voxels)(self.size, _SIGMA_SHARE, _MOST_LEVEL)
 
     def add(self, cloud: DenseCloud, sigma: np.ndarray) -> None:
         """Takes the points of a keyframe, and their sigmas (N,) without the pose's, metres."""
-        if not len(cloud):
-            return
-        information = inverse(cloud.covariances.astype(np.float64))
-        weighted = _times(information, cloud.points)
-        sums = np.column_stack([information, weighted, cloud.intensity * cloud.views, cloud.views])
-        self._pending.append((_voxels(cloud.points, sigma, self.size), sums))
-        # Amortised: each point is sorted about as many times as the cloud triples.
-        if sum(len(part[0]) for part in self._pending) > min(2 * len(self._merged[0]), self._most):
-            self._merge()
-            if len(self._merged[0]) > self._most:
-                self._written.append(Path(self._folder.name) / f"{len(self._written)}.npz")
-                np.savez(self._written[-1], *self._merged)
-                self._merged = self._merged[0][:0], self._merged[1][:0]
+        self._voxels.add(cloud.points, cloud.covariances, sigma, cloud.intensity, cloud.views)
+        if len(self._voxels) > self._most:
+            self._written.append(Path(self._folder.name) / f"{len(self._written)}.npz")
+            np.savez(self._written[-1], *self._voxels.rows(0))
+            self._voxels = self._empty()
 
     def cloud(self, min_views: int = 1) -> DenseCloud:
         """The points that so many keyframes gave, or more, without those in whose voxels there are finer ones."""
         for path in self._written:
             with np.load(path) as parts:
-                self._pending.append((parts["arr_0"], parts["arr_1"]))
+                self._voxels.merge(*(parts[f"arr_{k}"] for k in range(3)))
         self._written = []
-        self._merge()
-        keys, sums = self._merged
-        seen = sums[:, 10] >= min_views
-        keys, sums = keys[seen], sums[seen]
+        keys, levels, sums = self._voxels.rows(min_views)
+        order = np.argsort(keys)
+        keys, levels, sums = keys[order], levels[order], sums[order]
         information, count = sums[:, :6], sums[:, 10]
         covariance = inverse(information)
         points = _times(covariance, sums[:, 6:9])
         finest = np.ones(len(keys), bool)
-        for level in range(1, int(keys[:, 3].max(initial=0)) + 1):
-            here = keys[:, 3] == level
-            finer = _at_level(points[keys[:, 3] < level], level, self.size)
-            finest[here] = ~np.isin(keys[here] @ _ONE_KEY, finer @ _ONE_KEY)
+        for level in range(1, int(levels.max(initial=0)) + 1):
+            here = levels == level
+            finer = _at_level(points[levels < level], level, self.size)
+            finest[here] = ~np.isin(keys[here], finer @ _ONE_KEY)
         return DenseCloud(
             points,
             (covariance * count[:, None]).astype(np.float32),
@@ -211,10 +205,42 @@ class VoxelCloud:
             count.astype(np.int32),
         ).select(finest)
 
-    def _merge(self) -> None:
-        parts = [self._merged, *self._pending]
-        keys, sums = (np.concatenate([part[k] for part in parts]) for k in range(2))
-        self._merged, self._pending = _sum_by_key(keys, sums), []
+
+class Voxels:
+    """Sums of what falls into each voxel: the twin of the compiled class.
+
+    Args:
+        size: of the finest voxel, metres.
+        share: of a point's sigma that its voxel's side must have.
+        most_level: how often a side is doubled at the most.
+    """
+
+    def __init__(self, size: float, share: float, most_level: int) -> None:
+        assert (share, most_level) == (_SIGMA_SHARE, _MOST_LEVEL)
+        self._size, self._rows = size, (np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros((0, 11)))
+
+    def __len__(self) -> int:
+        return len(self._rows[0])
+
+    def add(self, points: np.ndarray, covariances: np.ndarray, sigma: np.ndarray, *grey_and_views: np.ndarray) -> None:
+        """Takes points (N, 3), covariances (N, 6), sigmas without the pose's, grey values and views (N,)."""
+        information, (grey, views) = inverse(covariances.astype(np.float64)), grey_and_views
+        sums = np.column_stack([information, _times(information, points), grey * views, views])
+        cells = _voxels(points, sigma, self._size)
+        self.merge(cells @ _ONE_KEY, cells[:, 3].astype(np.uint8), sums)
+
+    def merge(self, *rows: np.ndarray) -> None:
+        """Takes rows as `rows` gives them."""
+        keys, levels, sums = (np.concatenate([self._rows[k], rows[k]]) for k in range(3))
+        order, first = _groups(keys)
+        total = np.add.reduceat(sums[order], first) if len(keys) else sums
+        self._rows = keys[order[first]], levels[order[first]], total
+
+    def rows(self, min_views: int) -> tuple[np.ndarray, ...]:
+        """Packed voxels and their levels (M,), and (M, 11) sums of information, that times points, grey values and
+        views, of those that so many views or more gave."""
+        seen = self._rows[2][:, 10] >= min_views
+        return tuple(each[seen] for each in self._rows)
 
 
 def _voxels(points: np.ndarray, sigma: np.ndarray, size: float) -> np.ndarray:
@@ -246,18 +272,6 @@ def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     xx, xy, xz, yy, yz, zz = six.T
     x, y, z = vectors.T
     return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], axis=-1)
-
-
-def _sum_by_key(keys: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with the same key (N, 4) summed."""
-    order, first = _groups(keys @ _ONE_KEY)
-    count = np.diff(np.r_[first, len(order)])
-    total, group = sums[order[first]], np.arange(len(first))
-    # Few voxels have many rows: a row of each at a time is half the work of sums over sorted rows.
-    for row in range(1, count.max(initial=0)):
-        group = group[count[group] > row]
-        total[group] += sums[order[first[group] + row]]
-    return keys[order[first]], total
 
 
 def _groups(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -65,7 +65,10 @@ class DepthView:
     @classmethod
     def of(cls, image: np.ndarray, measured: DisparityMap) -> DepthView:
         """The view of a keyframe with such an image (H, W) uint8 and disparities."""
-        sampled = cv2.merge([measured.disparity, measured.variance, *disparity_slope(measured.disparity)])
+        if kernels is not None:
+            sampled = kernels.sample_view(measured.disparity, measured.variance)
+        else:
+            sampled = cv2.merge([measured.disparity, measured.variance, *disparity_slope(measured.disparity)])
         return cls(image.astype(np.float32), measured, np.asarray(sampled))
 
 
@@ -277,7 +280,7 @@ def _measure(
 def _compare(image: np.ndarray, known: np.ndarray, grey: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Means of weight, difference and its square in windows, and flow u and v, to a view with such grey values (N,)."""
     if kernels is not None:
-        weight, difference, square, warped = kernels.compare(image, known, grey)
+        *windows, warped = kernels.compare(image, known, grey)
     else:
         there = np.isfinite(grey)
         pixels, grey = known[there], grey[there]
@@ -285,13 +288,12 @@ def _compare(image: np.ndarray, known: np.ndarray, grey: np.ndarray) -> tuple[li
         weight.ravel()[pixels] = 1.0
         difference.ravel()[pixels] = image.ravel()[pixels] - grey
         warped.ravel()[pixels] = grey.clip(0, 255).astype(np.uint8)
-        square = difference**2
+        windows = [window_mean(each) for each in (weight, difference, difference**2)]
     # What the warp leaves of the motion: a window of a smooth texture looks alike after several pixels.
     small, moved = (shrink(each, _FLOW_SCALE) for each in (image, warped))
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     search.setFinestScale(0)
     flow = cv2.split(search.calc(small, moved, np.zeros((*small.shape, 2), np.float32)))
-    windows = [window_mean(each) for each in (weight, difference, square)]
     return windows, [np.asarray(cv2.resize(each, image.shape[::-1])) for each in flow]
 
 

@@ -194,15 +194,24 @@ def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) 
         slope = cv2.remap(gradient, u - smooth, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         moved, bound = _gauss_newton(reference, warped, slope, weight)
         departs, found = found, np.where(known, smooth - moved, _NOWHERE)
-    # What the last step began with, about the smooth surface.
+    # Rectification leaves as much along the rows as across them, where it can be seen.
+    variance = _variance(found, departs, smooth, bound, _FLOOR + float(np.mean(offset**2)))
+    return DisparityMap(np.where(known, found, np.float32(np.nan)), variance)
+
+
+def _variance(
+    found: np.ndarray, departs: np.ndarray, smooth: np.ndarray, bound: np.ndarray, floor: float
+) -> np.ndarray:
+    """Variances (H, W) of disparities, pixels squared, by what the last step began with about the smooth surface."""
+    if kernels is not None:
+        limits = _NOWHERE, _SAME_SURFACE, _WIDEST_EDGE, floor, _BY_BOUND, _BY_RELIEF, _BY_EDGE
+        return np.asarray(kernels.variance(found, departs, smooth, bound, limits))
+    known = found > _NOWHERE
     relief = np.where(known, np.minimum(np.abs(departs - smooth), _SAME_SURFACE), np.float32(0.0)) ** 2
     inverse = np.float32(1.0) / np.maximum(window_mean(known.astype(np.float32)), np.float32(1e-3))
     aligned = np.where(known, found, np.float32(0.0))
     edge = np.minimum(np.abs(aligned - window_mean(aligned) * inverse), _WIDEST_EDGE) ** 2
-    # Rectification leaves as much along the rows as across them, where it can be seen.
-    variance = np.float32(_FLOOR + float(np.mean(offset**2))) + _BY_BOUND * bound + _BY_EDGE * edge
-    variance += _BY_RELIEF * (window_mean(relief) * inverse)
-    return DisparityMap(np.where(known, aligned, np.float32(np.nan)), variance)
+    return np.float32(floor) + _BY_BOUND * bound + _BY_EDGE * edge + _BY_RELIEF * (window_mean(relief) * inverse)
 
 
 def _gauss_newton(

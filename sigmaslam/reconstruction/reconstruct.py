@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -34,8 +35,11 @@ MIN_VIEWS = 2
 """Keyframes that a point of the cloud needs, half as many as there are at the most."""
 # Points less certain than this share of their depth are left out.
 _MAX_SIGMA = 0.05
+# Of the window around a point, pixels, this share must be points, too. Borders of what is measured, where foregrounds
+# are too wide, hold a half (rooms: a third) of the gross errors of rendered streets and a tenth of their points.
+_SURROUNDINGS, _LEAST_POINTS = 13, 0.6
 # Side of the finest voxels, in pixels at the median depth of the first keyframe.
-_VOXEL_PIXELS = 3.0
+_VOXEL_PIXELS = 2.0
 _NumberedView = tuple[int, np.ndarray, DepthView]
 
 
@@ -62,7 +66,7 @@ class ReconstructionSummary:
     seconds_a_keyframe: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class KeyframeDepth:
     """The depths of one keyframe.
 
@@ -89,11 +93,12 @@ class KeyframeDepth:
         """(H, W) of the fused disparities, that of the offset included; pixels squared."""
         return np.asarray(self.fused.variance + np.float32(self.offset_sigma**2))
 
-    @property
+    @cached_property
     def is_point(self) -> np.ndarray:
-        """(H, W) bool: confirmed and near enough to be certain."""
-        certain = self.variance < (_MAX_SIGMA * self.fused.disparity) ** 2
-        return np.asarray(self.fused.is_confirmed & certain)
+        """(H, W) bool: confirmed, near enough to be certain, and among others that are."""
+        certain = self.fused.is_confirmed & (self.variance < (_MAX_SIGMA * self.fused.disparity) ** 2)
+        share = cv2.blur(certain.astype(np.float32), (_SURROUNDINGS, _SURROUNDINGS))
+        return np.asarray(certain & (share > _LEAST_POINTS))
 
     def cloud(self, camera: RectifiedStereo, voxel: float) -> tuple[DenseCloud, np.ndarray]:
         """The points in the world, about one a voxel of that side, metres; and their sigmas (N,) by the depth alone."""
@@ -121,7 +126,7 @@ def reconstruct_run(
         mesh: PLY file of a mesh; needs Open3D.
         moved_to: where the run's input is, if it has moved.
         network: ONNX file of a stereo network in place of semi-global matching.
-        voxel: side of the finest voxels that points are merged in, metres; None: three pixels at the median depth.
+        voxel: side of the finest voxels that points are merged in, metres; None: two pixels at the median depth.
         max_sigma: points with a larger sigma are left out, metres; None: with one of a twentieth of their distance.
         min_views: keyframes that must have given a point.
         every: of so many keyframes one is used.

@@ -100,7 +100,7 @@ def test_the_order_in_which_keyframes_come_does_not_matter():
         voxels = VoxelCloud(0.7, most)
         for part in order:
             _add(voxels, part)
-            assert len(voxels._merged[0]) <= most
+            assert len(voxels._voxels) <= most
         clouds.append(voxels.cloud())
     for other in clouds[1:]:
         for first, second in zip(clouds[0].columns(), other.columns(), strict=True):
@@ -128,6 +128,22 @@ def test_compiled_thinning_is_that_of_numpy(monkeypatch: pytest.MonkeyPatch):
     for one, another in zip(compiled.columns(), pixels.thinned(CAMERA, 0.3).columns(), strict=True):
         np.testing.assert_array_equal(one, another)
     assert len(compiled) < 3000
+
+
+def test_compiled_voxels_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("sigmaslam.reconstruction._depths", reason="installed without a compiler")
+    rng = np.random.default_rng(4)
+    parts = [_points(rng.normal(0, 1, (500, 3)).tolist(), rng.uniform(1, 99, 500).tolist()) for _ in range(3)]
+    clouds = []
+    for _ in range(2):
+        voxels = VoxelCloud(0.3, 400)
+        for part in parts:
+            _add(voxels, part)
+        clouds.append(voxels.cloud())
+        monkeypatch.setattr(cloud, "kernels", None)
+    assert 100 < len(clouds[0]) < 1000
+    for one, another in zip(clouds[0].columns(), clouds[1].columns(), strict=True):
+        np.testing.assert_allclose(one, another, rtol=1e-6, atol=1e-9)
 
 
 def test_the_file_holds_every_number(tmp_path: Path):

@@ -140,6 +140,20 @@ def test_compiled_fusion_is_that_of_numpy(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_allclose(compiled.variance[same], numpy.variance[same], rtol=1e-3)
 
 
+def test_compiled_views_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("sigmaslam.reconstruction._depths", reason="installed without a compiler")
+    rng = np.random.default_rng(3)
+    v, u = np.mgrid[:41, :57].astype(np.float32)
+    disparity = 30.0 + 0.3 * u - 0.2 * v + rng.normal(0, 0.1, u.shape).astype(np.float32)
+    disparity[rng.random(u.shape) < 0.3] = np.nan
+    measured = DisparityMap(disparity, rng.random(u.shape).astype(np.float32))
+    compiled = DepthView.of(np.zeros(u.shape, np.uint8), measured).sampled
+    monkeypatch.setattr(depth_fusion, "kernels", None)
+    numpy = DepthView.of(np.zeros(u.shape, np.uint8), measured).sampled
+    np.testing.assert_allclose(compiled, numpy, atol=1e-4)
+    np.testing.assert_allclose(np.median(compiled[..., 2:][np.isfinite(disparity)], axis=0), [0.3, -0.2], atol=0.02)
+
+
 def test_compiled_functions_refuse_what_they_would_read_beyond():
     kernels = pytest.importorskip("sigmaslam.reconstruction._depths", reason="installed without a compiler")
     image, one = np.zeros((9, 9), np.float32), np.zeros(1)
