@@ -1,6 +1,7 @@
 """Run folders as `track` writes them, without tracking."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.live.frame_sink import TrackedFrame
 from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME, PictureRecorder
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
@@ -106,3 +108,9 @@ def some_frame(generator: np.random.Generator, count: int, first: int = 0) -> Ma
     views = LandmarkViews(rows, places, noise, np.zeros((count, 3, 2)))
     matches = GuidedMatches(views, generator.uniform(0.5, 1, count), rows)
     return MatchedFrame(left, right, rows + first, matches, np.arange(count) % 5 != 0 if count else None)
+
+
+def frame_at(number: int, pose: np.ndarray, status: str = "tracking") -> TrackedFrame:
+    """A frame of noise with thirty matches."""
+    estimate = replace(some_estimate(0.1 * number, status, 30.0, 30), T_world_camera=pose, covariance=1e-4 * np.eye(6))
+    return TrackedFrame(number, estimate, some_frame(np.random.default_rng(number), 30))

@@ -20,7 +20,7 @@ from sigmaslam.readers import open_sequence
 from sigmaslam.slam.mapping import KeyframeTracks
 from tests.support.commands import run_here
 from tests.support.demo_parts import copy_frames
-from tests.support.recorded_runs import some_estimate, some_frame
+from tests.support.recorded_runs import frame_at
 
 FRAMES = 12
 
@@ -33,12 +33,6 @@ def sequence(demo_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.fixture(scope="module")
 def camera(demo_sequence: Path) -> StereoCamera:
     return open_sequence(demo_sequence).camera
-
-
-def frame_at(number: int, pose: np.ndarray, status: str = "tracking") -> TrackedFrame:
-    """A frame of noise with thirty matches."""
-    estimate = replace(some_estimate(0.1 * number, status, 30.0, 30), T_world_camera=pose, covariance=1e-4 * np.eye(6))
-    return TrackedFrame(number, estimate, some_frame(np.random.default_rng(number), 30))
 
 
 @pytest.mark.long

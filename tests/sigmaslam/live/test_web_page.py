@@ -24,8 +24,8 @@ from sigmaslam.readers import open_sequence
 from sigmaslam.readers.selection import Selection
 from sigmaslam.runs.request import LiveOptions
 from sigmaslam.slam.estimate import CalibrationEstimate
-from tests.sigmaslam.live.test_video import frame_at
 from tests.support.commands import assert_refused, run_here
+from tests.support.recorded_runs import frame_at
 from tests.support.tracked import track
 
 METHODS = ("POST", "PUT", "DELETE", "PATCH", "HEAD", "OPTIONS", "BREW")
