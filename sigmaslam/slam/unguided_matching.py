@@ -97,6 +97,7 @@ class UnguidedMatcher:
     def _pose_of(
         self, key: StereoView, matches: TemporalMatches, excludes: Callable[[np.ndarray], bool] | None = None
     ) -> RelativePose | None:
+        """Pose of the view that these matches of a keyframe are in, relative to it; None where there is none."""
         rows = matches.key_index
         return estimate_scene_pose(
             self.camera,
