@@ -125,5 +125,5 @@ def _look_alike(camera: RectifiedStereo, measured: np.ndarray, T_key_camera: np.
     points = camera.triangulate(measured)
     away = points - T_key_camera[:3, 3]
     far, near = np.linalg.norm(points, axis=1), np.linalg.norm(away, axis=1)
-    zoom = near / far
-    return (np.abs(np.log(zoom)) < np.log(_ALIKE_ZOOM)) & (np.sum(points * away, axis=1) > _ALIKE_COSINE * near * far)
+    same_side = np.sum(points * away, axis=1) > _ALIKE_COSINE * near * far
+    return (np.abs(np.log(near / far)) < np.log(_ALIKE_ZOOM)) & same_side

@@ -257,14 +257,7 @@ def _project(
     by_seen[:, 1, 1], by_seen[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
     by_seen[:, 2, 2] = -focal * inverse_depth / z**2
     by_pose = np.concatenate([by_seen * inverse_depth[:, None, None], -by_seen @ skew(seen)], axis=2)
-    by_landmark = by_seen @ np.stack(
-        [
-            np.tile(R[:, 0] / camera.fx, (len(z), 1)),
-            np.tile(R[:, 1] / camera.fy, (len(z), 1)),
-            np.tile(t / focal, (len(z), 1)),
-        ],
-        axis=2,
-    )
+    by_landmark = by_seen @ np.column_stack([R[:, 0] / camera.fx, R[:, 1] / camera.fy, t / focal])
     by_landmark[:, 2, 2] += 1.0 / z
     return predicted, front, by_pose, by_landmark
 
