@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 from rich.console import Console
@@ -14,8 +14,8 @@ from sigmaslam.cli.extras import need_extra
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text, check_new_folder, csv_text, make_folder
 
-FILTERS = ("ukf", "ekf", "iterated")
-"""To localise with, by name."""
+FilterKind = Literal["ukf", "ekf", "iterated"]
+"""Filters to localise with."""
 _Pose = tuple[float, float, float]
 """In the plane: metres, metres, radians."""
 Knowledge = Literal["known", "unknown"]
@@ -29,9 +29,7 @@ def localize(
         Literal["auto", "mrclam", "tubes", "csv", "starry"], typer.Option(help="Kind of recording; auto: by the files.")
     ] = "auto",
     robot: Annotated[int | None, typer.Option(help="Number of a robot.", show_default="all, as one batch")] = None,
-    filter: Annotated[
-        Literal["ukf", "ekf", "iterated"], typer.Option(help="Unscented, extended or iterated unscented.")
-    ] = "ukf",
+    filter: Annotated[FilterKind, typer.Option(help="Unscented, extended or iterated unscented.")] = "ukf",
     map: Annotated[
         Knowledge, typer.Option(help="Places of the landmarks: as the recording has them, or to be found on the way.")
     ] = "known",
@@ -81,7 +79,7 @@ def localize(
     settings |= {"association": association, "lag": lag if smooth else None}
     rows: list[_Row] = []
     with Console(stderr=True).status("reading") as status:
-        for name in FILTERS if compare else [filter]:
+        for name in get_args(FilterKind) if compare else [filter]:
             folder, run = out / name if compare else out, {**settings, "filter": name}
             try:
                 if kind == "starry":

@@ -18,7 +18,6 @@ from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.live.estimate_stream import PipeStream, open_stream
 from sigmaslam.live.frame_sink import FrameSink, ThreadedSink, check_sink_path
 from sigmaslam.live.video import VideoSink
-from sigmaslam.live.web_page import WebPageSink
 from sigmaslam.run_record.frame_table import TRACKED
 from sigmaslam.run_record.run_folder import RERUN_NAME, VIDEO_NAME, describe_camera
 from sigmaslam.run_record.verdict import calibration_verdict, expected_offset
@@ -99,7 +98,9 @@ def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
     return RerunSink(path, camera)
 
 
-def _open_page(address: str, camera: StereoCamera) -> WebPageSink:
+def _open_page(address: str, camera: StereoCamera) -> FrameSink:
+    from sigmaslam.live.web_page import WebPageSink
+
     expected = expected_offset(describe_camera(camera))
 
     def judge(calibration: CalibrationEstimate, statuses: Counter[str], points: int) -> str:

@@ -74,8 +74,7 @@ class WebPageSink:
         self._statuses = Counter[str]()
         self._times = deque[float](maxlen=_RATED)
         self._picture, self._drawn = b"", -_INTERVAL
-        serve = self._server.serve_forever
-        threading.Thread(target=serve, args=(_POLL,), name="sigmaslam-web-page", daemon=True).start()
+        threading.Thread(target=self._server.serve_forever, args=(_POLL,), name="sigmaslam-page", daemon=True).start()
 
     def add(self, frame: TrackedFrame) -> None:
         """Takes a frame."""

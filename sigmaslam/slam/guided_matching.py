@@ -162,9 +162,7 @@ class GuidedMatcher:
         S = S[:, :2, :2] + np.eye(2)
         u, v = predicted[:, 0], predicted[:, 1]
         inside = in_front & (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
-        # The larger eigenvalue.
-        across = np.hypot(0.5 * (S[:, 0, 0] - S[:, 1, 1]), S[:, 0, 1])
-        inside &= 0.5 * (S[:, 0, 0] + S[:, 1, 1]) + across < self.config.search_limit**2
+        inside &= within_reach(S, self.config.search_limit)
         if usable is not None:
             inside[inside] = pixels_in(usable, predicted[inside, :2])
         rows, predicted, S = rows[inside], predicted[inside], S[inside]
@@ -208,6 +206,12 @@ class GuidedMatcher:
             noise, common = self.noise.split(noise)
         views = LandmarkViews(np.concatenate(landmarks), matches.measured, noise, common)
         return GuidedMatches(views, matches.probability, np.concatenate([rows for rows, _, _ in parts]), streaked)
+
+
+def within_reach(covariance: np.ndarray, limit: float) -> np.ndarray:
+    """(K,) bool, whether the larger sigmas of places with covariances (K, 2, 2) are below a limit, pixels."""
+    u, v = covariance[:, 0, 0], covariance[:, 1, 1]
+    return np.asarray(0.5 * (u + v) + np.hypot(0.5 * (u - v), covariance[:, 0, 1]) < limit**2)
 
 
 def _excess(departure: np.ndarray, covariance: np.ndarray) -> float:

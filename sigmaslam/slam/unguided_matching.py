@@ -16,6 +16,7 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import pixels_in
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.guided_matching import within_reach
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 from sigmaslam.two_view.scene_pose import estimate_scene_pose
 from sigmaslam.two_view.stereo_pose import MIN_DISPARITY, RelativePose, foresee
@@ -80,12 +81,13 @@ class UnguidedMatcher:
         sigma, first = self._sigmas(key, index), first.with_shared_errors(errors)
         predicted, covariance, inside = foresee(self.camera, measured, sigma, first)
         covariance = covariance[:, :2, :2] + np.eye(2)
-        inside[inside] = True if view.usable is None else pixels_in(view.usable, predicted[inside, :2])
-        sought = np.flatnonzero(inside & (np.linalg.eigvalsh(covariance)[:, -1] < self.config.search_limit**2))
+        if view.usable is not None:
+            inside[inside] = pixels_in(view.usable, predicted[inside, :2])
+        sought = np.flatnonzero(inside & within_reach(covariance, self.config.search_limit))
         slope = np.zeros((len(sought), 2)) if key.slope is None else key.slope[index[sought]]
         maps = plane_maps(self.camera, measured[sought], slope, se3_inverse(first.T_key_camera))
-        place, disparity = predicted[sought, :2], predicted[sought, 2]
-        search = KeypointSearch(key, index[sought], place, covariance[sought], maps, disparity)
+        seen = predicted[sought]
+        search = KeypointSearch(key, index[sought], seen[:, :2], covariance[sought], maps, seen[:, 2])
         found = self._pose_of(key, self.frontend.match(search, view).within(view.usable))
         if found is None:
             return None

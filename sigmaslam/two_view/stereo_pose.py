@@ -191,14 +191,9 @@ class _StereoMatches:
     noise: np.ndarray
     weight: np.ndarray
 
-    def errors_of_calibration(self, T_camera_key: np.ndarray) -> np.ndarray:
-        """(M, 3, 15) by how much each error, of size one, changes the residuals of `linearise`."""
-        _, _, _, by_landmark = _project(self.camera, self.landmarks, T_camera_key)
-        here, there = (measured_errors(self.camera, uvd) for uvd in (self.measurement, self.landmarks))
-        return here - by_landmark @ there
-
-    def linearise(self, T_camera_key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual (M, 3), its derivative by a perturbation of T from the left (M, 3, 6), and information (M, 3, 3).
+    def linearise(self, T_camera_key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Residual (M, 3), derivatives of what is expected, by a perturbation of T from the left (M, 3, 6) and by the
+        landmark (M, 3, 3), and information (M, 3, 3).
 
         Unknown components, and points behind the camera, have zero information.
         """
@@ -208,7 +203,7 @@ class _StereoMatches:
         measured = np.isfinite(residual) & front[:, None]
         present = measured[:, :, None] & measured[:, None, :]
         information = np.where(present, np.linalg.inv(np.where(present, spread, np.eye(3))), 0.0)
-        return np.where(measured, residual, 0.0), by_pose, information
+        return np.where(measured, residual, 0.0), by_pose, by_landmark, information
 
     def equations(self, T_camera_key: np.ndarray, loss: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Squared errors (M,) in sigmas, infinite for points behind the camera, and the equations of Gauss-Newton.
@@ -226,7 +221,7 @@ class _StereoMatches:
             given = self.landmarks, self.landmark_sigma, self.measurement, self.noise, self.weight
             squared, sums = kernels.stereo_equations(intrinsics, *given, T_camera_key, loss)
             return squared, sums[:36].reshape(6, 6), sums[36:]
-        residual, by_pose, information = self.linearise(T_camera_key)
+        residual, by_pose, _, information = self.linearise(T_camera_key)
         squared = np.einsum("mi,mij,mj->m", residual, information, residual)
         weight = self.weight / (1.0 + squared / loss) ** 2
         weighted = by_pose.transpose(0, 2, 1) @ (information * weight[:, None, None])
@@ -298,7 +293,7 @@ def _pose_with_inliers(
     inliers = (matches.weight > 0) & (squared < scale * CHI_SQUARE_999[3])
     if inliers.sum() < MIN_POINTS:
         return None
-    residual, by_pose, information = (each[inliers] for each in matches.linearise(T_camera_key))
+    residual, by_pose, by_landmark, information = (each[inliers] for each in matches.linearise(T_camera_key))
     weighted = by_pose.transpose(0, 2, 1) @ information
     normal = (weighted @ by_pose).sum(axis=0)
     if not np.linalg.cond(normal) < _MAX_CONDITION:
@@ -306,7 +301,8 @@ def _pose_with_inliers(
     size = matches.camera.width, matches.camera.height
     shared = clustering(matches.landmarks[inliers, :2], size, (weighted @ residual[..., None])[..., 0], normal)
     # Of a place alone nothing is asked of its disparity.
-    by_error = np.nan_to_num(matches.errors_of_calibration(T_camera_key)[inliers])
+    seen, known = (measured_errors(matches.camera, uvd[inliers]) for uvd in (matches.measurement, matches.landmarks))
+    by_error = np.nan_to_num(seen - by_landmark @ known)
     covariance = np.linalg.inv(normal)
     # A perturbation of T_camera_key from the left is the opposite of one of its inverse from the right.
     by_calibration = -covariance @ (weighted @ by_error).sum(axis=0)
