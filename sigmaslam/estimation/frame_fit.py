@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sigmaslam.geometry.se3 import se3_inverse
+
 
 @dataclass(frozen=True, slots=True)
 class FramePosterior:
@@ -32,6 +34,7 @@ class FrameFit:
 
     Attributes:
         pose: (4, 4) T_world_camera.
+        last: (4, 4) T_world_keyframe of the last keyframe, from which `step` is.
         relative: (6, 6) covariance of the pose relative to the last keyframe, perturbed from the left in the world, as
             far as it comes from matches and motion.
         covariance: (6, 6) of the pose, likewise.
@@ -46,6 +49,7 @@ class FrameFit:
     """
 
     pose: np.ndarray
+    last: np.ndarray
     relative: np.ndarray
     covariance: np.ndarray
     calibration: np.ndarray
@@ -72,6 +76,11 @@ class FrameFit:
     def nis_before_scaling(self) -> float:
         """NIS per degree of freedom by the noise that the views came with; a larger one excuses no chance agreement."""
         return self.noise_scale * self.nis_per_dof
+
+    @property
+    def step(self) -> np.ndarray:
+        """(4, 4) T_keyframe_camera since the last keyframe."""
+        return np.asarray(se3_inverse(self.last) @ self.pose)
 
     def spread_by(self, covariance: np.ndarray) -> FrameFit:
         """The same pose, less certain by a covariance (6, 6) that matches do not know of."""

@@ -28,11 +28,14 @@ class FrameUpdate:
     Args:
         window: whose posterior is the prior.
         iterations: linearisations with a robust loss.
+        moves_last: a frame's step is from where its own views have the last keyframe. A sensor of motion is surer of
+            the velocity than a keyframe is of its place, and would take that error for speed frame by frame. A velocity
+            by images is not, and gains nothing (docs/notebook, motion).
     """
 
-    def __init__(self, window: KeyframeWindow, iterations: int) -> None:
+    def __init__(self, window: KeyframeWindow, iterations: int, moves_last: bool = False) -> None:
         self._window = window
-        self._iterations = iterations
+        self._iterations, self._moves_last = iterations, moves_last
         self._rooted: tuple[WindowState, np.ndarray] | None = None
         self._padded: tuple[WindowState, np.ndarray, np.ndarray] | None = None
 
@@ -124,6 +127,7 @@ class FrameUpdate:
         cross, size = spread[frame, last], (self._window.camera.width, self._window.camera.height)
         return FrameFit(
             nearest_rigid(se3_exp(offset[frame]) @ pose),
+            se3_exp(self._moves_last * offset[last]) @ posterior.poses[-1],
             spread[frame, frame] + spread[last, last] - cross - cross.T,
             spread[frame, frame],
             posterior.calibration + offset[CALIBRATION],

@@ -153,8 +153,7 @@ class Localiser:
         """
         if prediction.squared_departure(fit.pose) <= ACCEPTANCE.jump**2:
             return True
-        step = se3_inverse(self.window.posterior.poses[-1]) @ fit.pose
-        if time_error(self.motion, step, self.frame_clock.interval) != 0.0:
+        if time_error(self.motion, fit.step, self.frame_clock.interval) != 0.0:
             return True
         anchor = self.window.landmarks.anchor
         earlier = anchor[matches.searched] < len(self.window) - 1

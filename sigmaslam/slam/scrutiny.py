@@ -140,11 +140,10 @@ class Scrutiny:
         return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
     def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
-        step = se3_inverse(self._window.posterior.poses[-1]) @ fit.pose
-        error = time_error(self._motion, step, self._clock.interval, self._had_other_times)
+        error = time_error(self._motion, fit.step, self._clock.interval, self._had_other_times)
         # What goes on is an acceleration: images out of order jump to and fro.
         is_other = error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0)
-        excess = surprise(self._motion, step)
+        excess = surprise(self._motion, fit.step)
         if is_other:
             self._motion.doubt_time(error * self._clock.interval)
         elif excess > 1.0:

@@ -121,7 +121,7 @@ def find_scene_behind(
     window, views = localiser.window, matches.views
     rows, prediction = views.landmark, Prediction.of(window, localiser.motion)
     # Far parts would side with a prediction that the image contradicts, and near ones seem to move.
-    excess = surprise(localiser.motion, se3_inverse(window.posterior.poses[-1]) @ fit.pose)
+    excess = surprise(localiser.motion, fit.step)
     if excess > 1.0:
         prediction = Prediction(prediction.pose, excess * prediction.covariance)
         fit = localiser.fit_again(matches, fit, prediction)

@@ -129,7 +129,7 @@ class StereoTracker:
         self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
         self._frontend = frontend = loading.get()
-        update = FrameUpdate(window, config.iterations)
+        update = FrameUpdate(window, config.iterations, bool(motion.sensors))
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
@@ -292,8 +292,7 @@ class StereoTracker:
         seen = matches.views.select(fit.inliers)
         self._admission.confirm(seen, self._window)
         self._window.count_sightings(matches.searched, seen.landmark)
-        back = se3_inverse(self._window.posterior.poses[-1])
-        self._motion.correct(back @ fit.pose, turn_covariance(back, fit.relative))
+        self._motion.correct(fit.step, turn_covariance(se3_inverse(fit.last), fit.relative))
         if not matches.streaked:  # what streaks add to the noise is no scatter
             self._noise.adapt(fit.nis_per_dof)
         self._course.track(timestamp)

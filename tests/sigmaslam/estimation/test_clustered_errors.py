@@ -36,7 +36,9 @@ def test_independent_errors_have_nothing_in_common():
 def fit_of(clustering: float) -> FrameFit:
     zero = np.zeros((6, 6))
     joint, scores = FramePosterior(np.zeros(6), zero, zero, zero, np.zeros(6)), np.zeros((9, 6))
-    return FrameFit(np.eye(4), zero, zero, np.zeros(12), joint, np.ones(9, bool), 9.0, 27, 1.0, clustering, scores)
+    return FrameFit(
+        np.eye(4), np.eye(4), zero, zero, np.zeros(12), joint, np.ones(9, bool), 9.0, 27, 1.0, clustering, scores
+    )
 
 
 def test_frames_are_averaged_but_a_large_factor_counts_at_once():

@@ -112,6 +112,11 @@ def test_a_frame_s_relative_pose_is_that_of_the_window_s_own_update():
         assert in_sigmas(one, other) < 1e-6
     np.testing.assert_allclose(poses, others, atol=1e-9)
     np.testing.assert_allclose(found.pose, moved.poses[-1], atol=1e-9)
+    np.testing.assert_array_equal(found.last, state.poses[-1])
+    by_sensor = FrameUpdate(window, ITERATIONS, moves_last=True).fit(views, state.poses[-1] @ STEP, step, 5)
+    assert by_sensor is not None
+    assert np.abs(by_sensor.step - found.step).max() > 1e-6
+    np.testing.assert_allclose(by_sensor.step, se3_inverse(moved.poses[-2]) @ moved.poses[-1], atol=1e-9)
 
 
 def test_relating_a_frame_changes_nothing():
