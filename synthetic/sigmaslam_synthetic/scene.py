@@ -92,6 +92,8 @@ class Lights:
         shadows: whether the parallel light casts shadows.
         lamp: strength of a light that the camera carries, at 1 metre; it falls off with 1/r^2.
         lamp_offset: its place in the left camera's frame, metres.
+        extinction: share of its light that what is seen loses in a metre of haze, which the sky's replaces (Koschmieder
+            1924): 3.9 by the metres at which 2 % of a contrast are left; 0 in clear air.
     """
 
     ambient: float = 0.3
@@ -100,6 +102,7 @@ class Lights:
     shadows: bool = True
     lamp: float = 0.0
     lamp_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    extinction: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,3 +27,6 @@ def test_details_come_besides_the_street_and_leave_the_preset_as_it_is():
         isinstance(body.shape, Ellipsoid) for body in plain.scene.bodies
     )
     assert max(each.specular for each in detailed.scene.materials) == 1.0
+    hazes = [load_world(str(FILE))(np.random.default_rng(k), wish).scene.lights.extinction for k in range(7, 13)]
+    assert 0.0 in hazes
+    assert 3.912 / 3000.0 < max(hazes) < 3.912 / 150.0

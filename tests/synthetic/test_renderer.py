@@ -185,6 +185,19 @@ def test_the_lamp_of_the_camera_falls_off_with_the_square_of_the_distance() -> N
     np.testing.assert_allclose(levels[0] / levels[1], 4.0, rtol=1e-3)
 
 
+def test_haze_takes_light_along_the_whole_ray_and_gives_the_sky_s() -> None:
+    """A wall across the view, in clear air and where 2 % of a contrast are left at 39 metres."""
+    wall = Body(Panel(60.0, 60.0), 0, (0.0, 0.0, 12.0))
+    clear, hazy = (
+        render(Renderer(Scene((wall,), (plain(0.3),), Lights(0.5, extinction=k), sky=0.8)), CAMERA, (np.eye(4), 0.0))
+        for k in (0.0, 0.1)
+    )
+    rays = (pixel_grid(CAMERA) - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
+    left = np.exp(-0.1 * 12.0 * np.hypot(1.0, np.linalg.norm(rays, axis=-1)))
+    expected = left * clear.image[0].numpy() + (1 - left) * 0.8
+    np.testing.assert_allclose(hazy.image[0].numpy(), expected, rtol=1e-4)
+
+
 def test_highlights_move_with_the_camera() -> None:
     wall = Body(Panel(1.0, 1.0), 0, (0.0, 0.0, 0.1))
     wet = Material(0.3, (Texture("noise", 0, 1.0, 0.0),), specular=0.5, gloss=200.0)

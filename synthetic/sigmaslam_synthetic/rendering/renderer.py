@@ -90,7 +90,7 @@ class Renderer:
         )
         self._movers = [scene.bodies[k] for k in moving]
         materials = [scene.materials[body.material] for body in scene.bodies]
-        self._shader = Shader(facets, body_of, self.surfaces.mover, materials, scene.lights, self.device)
+        self._shader = Shader(facets, body_of, self.surfaces.mover, materials, scene.lights, scene.sky, self.device)
         casts = np.array([body.shadow for body in scene.bodies])[body_of]
         self._casters = tensor(np.flatnonzero(casts))
         static = facets.origin[mover == 0]

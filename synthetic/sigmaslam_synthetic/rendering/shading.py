@@ -97,6 +97,7 @@ class Shader:
         body, mover: (F,) int of each facet.
         materials: of each body.
         lights: of the scene.
+        sky: its radiance.
         device: where shading runs.
     """
 
@@ -107,9 +108,10 @@ class Shader:
         mover: Tensor,
         materials: Sequence[Material],
         lights: Lights,
+        sky: float,
         device: torch.device,
     ) -> None:
-        self._mover, self._lights = mover, lights
+        self._mover, self._lights, self._sky = mover, lights, sky
         textures = sorted({(layer.kind, layer.seed) for material in materials for layer in material.layers})
         self._atlas = Atlas(textures, device)
         corner = {texture: self._atlas.corner(k) for k, texture in enumerate(textures)}
@@ -213,7 +215,11 @@ class Shader:
             strength = lights.lamp / square
             light = light + strength * _dot(normal, reach).clamp_min(0)
             result = result + shine(strength, reach)
-        return torch.addcmul(result, albedo, light)
+        result = torch.addcmul(result, albedo, light)
+        if lights.extinction > 0:
+            clear = torch.exp(-lights.extinction * torch.linalg.vector_norm(towards, dim=0))
+            result = torch.lerp(torch.full_like(result, self._sky), result, clear)
+        return result
 
     def _sun_directions(self, sight: Sight, T_mover_view: Tensor) -> Tensor:
         """Direction towards the sun in the frame of each mover, (V, M, 3); mover 0 is the world."""
