@@ -15,13 +15,13 @@ from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 
-def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[int], object]) -> int:
+def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[], object]) -> int:
     """Write `left/` and `right/` PNG images, `times.txt` and `calibration.yaml`, which `track` reads.
 
     Args:
         sequence: what to rectify.
         out: folder, new or empty.
-        done: called with the number of pairs so far.
+        done: called after each pair.
 
     Returns:
         The number of pairs.
@@ -43,6 +43,6 @@ def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[int], o
         for eye, image in zip(("left", "right"), rectifier.rectify(frame.left, frame.right), strict=True):
             atomic_write_bytes(out / eye / f"{frame.index:06d}.png", cv2.imencode(".png", image)[1].tobytes())
         times.append(frame.timestamp)
-        done(len(times))
+        done()
     atomic_write_text(out / "times.txt", "".join(f"{time!r}\n" for time in times))
     return len(times)
