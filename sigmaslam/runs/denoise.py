@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.files import atomic_path, check_new_folder, make_folder
+from sigmaslam.files import atomic_write_bytes, check_new_folder, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
 from sigmaslam.progress import counted
 from sigmaslam.readers import StereoFrame
@@ -110,7 +110,7 @@ def denoise_files(
             path = out / f"{Path(name).stem}.png"
             if path.exists():
                 raise InputError(f"{source}: {name} and another image would both become {path.name}: rename one")
-            _write(path, result)
+            atomic_write_bytes(path, cv2.imencode(".png", to_bytes(result))[1].tobytes())
             count += 1
             done()
     if used is None:
@@ -151,8 +151,3 @@ def _check_size(image: np.ndarray, name: str) -> None:
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """Grey levels as an 8-bit image stores them."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    with atomic_path(path) as temporary:
-        cv2.imwrite(str(temporary), to_bytes(image))
