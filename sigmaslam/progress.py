@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -11,6 +13,14 @@ if TYPE_CHECKING:
 
 LINE_EVERY = 30.0
 """Seconds between lines."""
+
+
+@contextmanager
+def counted(title: str, total: int | None) -> Iterator[Callable[[], None]]:
+    """The progress of one task, of so many steps; the function is called after each."""
+    with open_progress() as progress:
+        task = progress.add_task(title, total=total, note="")
+        yield lambda: progress.update(task, advance=1)
 
 
 def open_progress(hidden: bool = False, console: Console | None = None, line_every: float = LINE_EVERY) -> Progress:

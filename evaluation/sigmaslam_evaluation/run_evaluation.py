@@ -122,7 +122,8 @@ def evaluate_run(
         T_body_followed = _followed_frame(estimate, true)
         true = Trajectory(true.timestamps, true.poses @ T_body_followed)
         of_truth = None if of_truth is None else of_truth.turned(se3_inverse(T_body_followed))
-    covariance = _read_covariance(run_or_trajectory / "covariance.npy", len(estimate)) if is_run else None
+    path = run_or_trajectory / "covariance.npy"  # of a run alone
+    covariance = read_covariances(path, len(estimate)) if path.is_file() else None
     matched_estimate, matched_truth = synchronise(estimate, true)
     predicted = np.zeros(len(estimate), bool) if frames is None else predicted_poses(frames, estimate.timestamps)
     evaluation = Evaluation(
@@ -185,7 +186,8 @@ def _evaluate_final(
             "same run"
         )
     final = Trajectory(estimate.timestamps, final.poses)
-    covariance = _read_covariance(run / FINAL_COVARIANCE, len(final))
+    path = run / FINAL_COVARIANCE
+    covariance = read_covariances(path, len(final)) if path.is_file() else None
     return FinalErrors(
         absolute_trajectory_error(final, truth, "se3"),
         absolute_trajectory_error(final, truth, "origin"),
@@ -227,12 +229,6 @@ def _followed_frame(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     """
     estimate_index, truth_index = associate(estimate, truth)
     return np.asarray(se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]])
-
-
-def _read_covariance(path: Path, count: int) -> np.ndarray | None:
-    if not path.is_file():
-        return None
-    return read_covariances(path, count)
 
 
 def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:

@@ -104,16 +104,12 @@ def exchange_weights(graph: Path, old: Mapping[str, np.ndarray], new: Mapping[st
 
 def graph_difference(graph: TracedModule, path: Path, compare: Compare) -> float:
     """Of a written graph from its module, on inputs that it was not traced with."""
-    actual = OnnxGraph(path)(feed_of(graph))
+    feed = {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
+    actual = OnnxGraph(path)(feed)
     with torch.no_grad():
         outputs = graph.module(*graph.checked)
     expected = [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
     return compare(actual, expected)
-
-
-def feed_of(graph: TracedModule) -> dict[str, np.ndarray]:
-    """The inputs by which it is checked."""
-    return {name: np.asarray(value) for name, value in zip(graph.inputs, graph.checked, strict=True)}
 
 
 def relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -148,13 +149,8 @@ def _files_of(path: Path) -> list[Path]:
     if any(child.suffix.lower() in IMAGE_SUFFIXES and not child.name.startswith(".") for child in path.iterdir()):
         return list_images(path)
     folders = sorted(child for child in path.iterdir() if child.is_dir() and not child.name.startswith("."))
-    inside = [file for folder in folders for file in _files_inside(folder)]
+    inside: list[Path] = []
+    for folder in folders:
+        with suppress(InputError):  # it may hold something else
+            inside += _files_of(folder)
     return inside or list_images(path)
-
-
-def _files_inside(folder: Path) -> list[Path]:
-    """Of a folder in a folder, which may hold something else, too."""
-    try:
-        return _files_of(folder)
-    except InputError:
-        return []

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
+from sigmaslam.table import Table
 
 BOARD_FORMS = "chessboard:9x6:0.025, charuco:8x6:0.04:0.03:DICT_5X5_100 or aprilgrid:6x6:0.088:0.3"
 
@@ -17,7 +18,7 @@ _MIN_CORNERS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class DetectedCorners:
+class DetectedCorners(Table):
     """Corners of a board in one image.
 
     Attributes:
@@ -27,9 +28,6 @@ class DetectedCorners:
 
     ids: np.ndarray
     pixels: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
 
 NOTHING = DetectedCorners(np.zeros(0, np.int64), np.zeros((0, 2)))

@@ -9,25 +9,19 @@ import numpy as np
 
 from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.files import atomic_write_bytes, atomic_write_text, check_new_folder, make_folder
-from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
+from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
 
-def rectified_camera(camera: StereoCamera, view: RectifiedStereo) -> StereoCamera:
-    """The calibration of a pair after rectification, known as well as before."""
-    eye = CameraModel(view.width, view.height, view.fx, view.fy, view.cx, view.cy)
-    return replace(camera, left=eye, right=eye, T_left_right=rigid_motion(np.eye(3), [view.baseline, 0.0, 0.0]))
-
-
-def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[int], object]) -> int:
+def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[], object]) -> int:
     """Write `left/` and `right/` PNG images, `times.txt` and `calibration.yaml`, which `track` reads.
 
     Args:
         sequence: what to rectify.
         out: folder, new or empty.
-        done: called with the number of pairs so far.
+        done: called after each pair.
 
     Returns:
         The number of pairs.
@@ -39,12 +33,16 @@ def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[int], o
     rectifier = StereoRectifier(sequence.camera)
     for eye in ("left", "right"):
         make_folder(out / eye)
-    write_calibration(out / "calibration.yaml", rectified_camera(sequence.camera, rectifier.rectified))
+    view = rectifier.rectified
+    model = CameraModel(view.width, view.height, view.fx, view.fy, view.cx, view.cy)
+    place = rigid_motion(np.eye(3), [view.baseline, 0.0, 0.0])
+    # Known as well as before.
+    write_calibration(out / "calibration.yaml", replace(sequence.camera, left=model, right=model, T_left_right=place))
     times = []
     for frame in sequence.frames():
         for eye, image in zip(("left", "right"), rectifier.rectify(frame.left, frame.right), strict=True):
             atomic_write_bytes(out / eye / f"{frame.index:06d}.png", cv2.imencode(".png", image)[1].tobytes())
         times.append(frame.timestamp)
-        done(len(times))
+        done()
     atomic_write_text(out / "times.txt", "".join(f"{time!r}\n" for time in times))
     return len(times)

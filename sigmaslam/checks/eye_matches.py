@@ -10,16 +10,13 @@ import numpy as np
 
 from sigmaslam.frontend.image_pair import MIN_PROBABILITY, match_features
 from sigmaslam.frontend.learned import LearnedDetector
-from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.frontend.lucas_kanade import follow_both_ways
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers.stereo_sequence import FrameStep
 from sigmaslam.table import Table
 
 _KEYPOINTS = 512
-_FLOW_WINDOW, _FLOW_LEVELS = 15, 4
-# Optical flow there and back may miss by so much, pixels.
-_MAX_MISS = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +96,9 @@ class EyeMatcher:
         places = matches.keypoints1.astype(np.float64)
         flow = np.full(places.shape, np.nan)
         if second is not None:
-            flow = _follow(right, self.rectifier.rectify(second.left, second.right)[1], places)
+            after = self.rectifier.rectify(second.left, second.right)[1]
+            there, good = follow_both_ways(right, after, places, places)
+            flow = np.where(good[:, None], there - places, np.nan)
         return EyeMatches(
             matches.keypoints0.astype(np.float64),
             places,
@@ -108,14 +107,6 @@ class EyeMatcher:
             flow,
             np.full(len(places), pair),
         )
-
-
-def _follow(image: np.ndarray, after: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(M, 2) optical flow of points (M, 2), NaN where it does not lead back."""
-    there, found = lucas_kanade(image, after, points, points, _FLOW_WINDOW, _FLOW_LEVELS)
-    back, returned = lucas_kanade(after, image, there, points, _FLOW_WINDOW, 1)
-    good = found & returned & (np.linalg.norm(back - points, axis=1) <= _MAX_MISS)
-    return np.where(good[:, None], there - points, np.nan)
 
 
 def draw_rows(left: np.ndarray, right: np.ndarray, matches: EyeMatches, tolerance: float) -> np.ndarray:

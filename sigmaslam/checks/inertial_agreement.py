@@ -7,7 +7,7 @@ from sigmaslam.estimation.accelerometer_axes import SIGNED_AXES, fit_axes
 from sigmaslam.estimation.inertial_motion import SENSOR_SIGMA
 from sigmaslam.estimation.inertial_turns import TurnFit, fit_turns
 from sigmaslam.geometry.se3 import nearest_rotation, rotation_log
-from sigmaslam.progress import open_progress
+from sigmaslam.progress import counted
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.stereo_sequence import StereoSequence
@@ -39,12 +39,11 @@ def check_motion(sequence: StereoSequence, threads: int = 2) -> list[Finding]:
     first = 0 if sequence.timestamps is None else _liveliest(np.asarray(sequence.timestamps), sequence.imu)
     part = sequence.select(Selection(first, _FRAMES))
     tracker = StereoTracker(sequence.camera, threads=threads)
-    with open_progress() as progress:
-        task = progress.add_task("motion", total=part.length, note="")
+    with counted("motion", part.length) as done:
         estimates = []
         for frame in part.frames():
             estimates.append(tracker.step(frame.left, frame.right, frame.timestamp))
-            progress.advance(task)
+            done()
     return judge_motion(
         np.array([each.timestamp for each in estimates]),
         np.array([each.T_world_camera for each in estimates]),

@@ -1,7 +1,5 @@
 """`sigmaslam calibrate`: cameras from images of a board; a calibration shown, converted or used."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +25,7 @@ from sigmaslam.calibration_files.foreign_calibrations import FORMS, write_foreig
 from sigmaslam.cli.extras import need_extra
 from sigmaslam.cli.options import Calibration, Format, Input, InputFormat, Size, read_sized
 from sigmaslam.errors import InputError
-from sigmaslam.progress import open_progress
+from sigmaslam.progress import counted
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.inertial import read_imu
 from sigmaslam.runs.calibrate_imu import calibrate_imu_by_run
@@ -90,7 +88,7 @@ def board(
     if board is None:
         if recording is None or len(images) != 1:
             raise InputError("--board is missing; only a run of `sigmaslam track`, with --imu, goes without it")
-        with _rounds() as done:
+        with counted("inertial rounds", MAX_ROUNDS) as done:
             found, camera = calibrate_imu_by_run(images[0], recording, done)
         typer.echo(describe_imu_calibration(found))
         write_imu_calibration(chain, (camera.left, camera.right), camera.T_left_right, found)
@@ -102,18 +100,16 @@ def board(
     moments = find_board_images(images)
     if recording is not None:
         image_times([each.name for each in moments])
-    with open_progress() as progress:
-        task = progress.add_task("images", total=len(moments), note="")
-        seen = read_board_views(moments, plan, lambda: progress.advance(task))
+    with counted("images", len(moments)) as done:
+        seen = read_board_views(moments, plan, done)
     for name, reason in seen.unreadable:
         typer.echo(f"left out  {name}: {reason}")
     if lens.value == "auto":
         result = calibrate_whole_images(seen.names, seen.views, plan.points, seen.sizes)
     else:
         result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
-    with open_progress() as progress:
-        task = progress.add_task("sigmas", total=RESAMPLES, note="")
-        result = widened(result, bootstrap_rigs(result, RESAMPLES, seed, lambda: progress.advance(task)))
+    with counted("sigmas", RESAMPLES) as done:
+        result = widened(result, bootstrap_rigs(result, RESAMPLES, seed, done))
     typer.echo(describe_board_calibration(result))
     write_board_calibration(out, result)
     if picture is not None:
@@ -121,7 +117,7 @@ def board(
         typer.echo(f"Picture: {picture}")
     typer.echo(f"Written: {out}")
     if recording is not None:
-        with _rounds() as done:
+        with counted("inertial rounds", MAX_ROUNDS) as done:
             found = calibrate_imu(board_path(result), recording.samples, recording.sensor, done=done)
         typer.echo(describe_imu_calibration(found))
         write_imu_calibration(chain, result.rig.eyes, result.rig.T_left_right, found)
@@ -156,15 +152,6 @@ def rectify(
 ) -> None:
     """Write rectified pairs without distortion: left/, right/, times.txt, calibration.yaml."""
     sequence = open_sequence(source, format.value, calibration)
-    with open_progress() as progress:
-        task = progress.add_task("pairs", total=sequence.length, note="")
-        count = write_rectified(sequence, out, lambda done: progress.update(task, completed=done))
+    with counted("pairs", sequence.length) as done:
+        count = write_rectified(sequence, out, done)
     typer.echo(f"{count} rectified pairs in {out}\nTry: sigmaslam track {out} --out run")
-
-
-@contextmanager
-def _rounds() -> Iterator[Callable[[], None]]:
-    """The progress of a calibration of an inertial sensor."""
-    with open_progress() as progress:
-        task = progress.add_task("inertial rounds", total=MAX_ROUNDS, note="")
-        yield lambda: progress.advance(task)

@@ -47,7 +47,8 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
     """
     sinks: list[FrameSink] = []
     if options.video is not None:
-        sinks.append(_open_video(options.video, out, camera))
+        check_sink_path("--video", options.video, out, VIDEO_NAME)
+        sinks.append(ThreadedSink(VideoSink(options.video, camera)))
     viewer = None if options.viewer is None else _open_viewer(options.viewer, out, camera)
     if options.dense is not None:
         sinks.append(_open_cloud(options.dense, out, camera, None if viewer is None else viewer.show_cloud))
@@ -74,11 +75,6 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
         told.wait(None)
     if told.is_broken:
         raise typer.Exit(UNREAD)
-
-
-def _open_video(path: Path, out: Path, camera: StereoCamera) -> FrameSink:
-    check_sink_path("--video", path, out, VIDEO_NAME)
-    return ThreadedSink(VideoSink(path, camera))
 
 
 def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:

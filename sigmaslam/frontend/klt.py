@@ -5,17 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.frontend.lucas_kanade import follow_both_ways
 from sigmaslam.frontend.nearest_neighbours import within_ellipses
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.frontend.types import Features, KeypointSearch, StereoView, TemporalMatches
 
-# Side of a patch, pixels, that of the flow that gives starts: larger ones straddle depths, smaller ones slide on edges.
-_WINDOW = 15
-# Above the image itself: in the smallest one half a patch is 112 pixels, as much as most disparities.
-_LEVELS = 4
-# Pixels that the way back may miss by: more keeps corners that slid along an edge, less loses those on slopes.
-_FORWARD_BACKWARD = 0.7
 # Of a followed corner, pixels per axis, for all alike; the tracker scales it as the NIS asks.
 _SIGMA = 0.3
 # Both eyes' places err: the root of two times as much, about.
@@ -65,7 +59,7 @@ class KltFrontend:
 def _match(search: KeypointSearch, start: np.ndarray, left: np.ndarray, right: np.ndarray) -> TemporalMatches:
     """Corners of a keyframe in a pair, from a start (K, 2)."""
     points = search.key.features.keypoints[search.index]
-    places, tracked = _follow(search.key.left, left, points, start)
+    places, tracked = follow_both_ways(search.key.left, left, points, start)
     if search.covariance is not None:
         tracked &= within_ellipses(places - search.predicted, search.covariance)
     places = places[tracked]
@@ -80,19 +74,8 @@ def _match(search: KeypointSearch, start: np.ndarray, left: np.ndarray, right: n
     )
 
 
-def _follow(
-    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, guess1: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Places in image 1, and whether tracking back from them returns to the starting points."""
-    height, width = image1.shape
-    guess1 = np.clip(guess1, 0, (width - 1, height - 1))
-    places, converged = lucas_kanade(image0, image1, points0, guess1, _WINDOW, _LEVELS)
-    back, returned = lucas_kanade(image1, image0, places, points0, _WINDOW, 1)
-    return places, converged & returned & (np.linalg.norm(back - points0, axis=1) <= _FORWARD_BACKWARD)
-
-
 def _disparity(left: np.ndarray, right: np.ndarray, points: np.ndarray) -> np.ndarray:
-    places, tracked = _follow(left, right, points, points)
+    places, tracked = follow_both_ways(left, right, points, points)
     disparity = points[:, 0] - places[:, 0]
     level = tracked & (np.abs(places[:, 1] - points[:, 1]) <= ROW_TOLERANCE) & (disparity > -2.0)
     return np.where(level, disparity, np.nan)

@@ -9,6 +9,12 @@ from sigmaslam.frontend.types import Refinement
 
 # At most 20 steps, or until one is below 0.01 px, a sixth of what the best matches err by (docs/notebook, noise).
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+# Side of a patch, pixels, that of the flow that gives starts: larger ones straddle depths, smaller ones slide on edges.
+_WINDOW = 15
+# Above the image itself: in the smallest one half a patch is 112 pixels, as much as most disparities.
+_LEVELS = 4
+# Pixels that the way back may miss by: more keeps corners that slid along an edge, less loses those on slopes.
+_FORWARD_BACKWARD = 0.7
 
 
 def lucas_kanade(
@@ -40,6 +46,17 @@ def lucas_kanade(
     places = found.reshape(-1, 2).astype(np.float64)
     inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
     return places, (status.ravel() > 0) & inside
+
+
+def follow_both_ways(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, guess1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 2) in image 1 from guesses (N, 2), and whether (N,) tracking back from them returns to the start."""
+    height, width = image1.shape
+    guess1 = np.clip(guess1, 0, (width - 1, height - 1))
+    places, converged = lucas_kanade(image0, image1, points0, guess1, _WINDOW, _LEVELS)
+    back, returned = lucas_kanade(image1, image0, places, points0, _WINDOW, 1)
+    return places, converged & returned & (np.linalg.norm(back - points0, axis=1) <= _FORWARD_BACKWARD)
 
 
 def refine(

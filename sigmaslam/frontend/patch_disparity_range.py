@@ -28,25 +28,28 @@ _LEAST, _BEYOND = -4, 8
 def dense_disparity(view: StereoView) -> np.ndarray:
     """(H / 2, W / 2) disparities in pixels of half the left image by semi-global matching, NaN where there is none."""
     largest = 0.5 * float(np.max(view.disparity, initial=0.0, where=np.isfinite(view.disparity)))
-    halves = [
+    left, right = (
         cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (view.left, view.right)
-    ]
-    levels = 16 * int(np.ceil((largest + _BEYOND - _LEAST) / 16))
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=_LEAST,
-        numDisparities=levels,
-        blockSize=_BLOCK,
-        P1=_SMALL_STEP,
-        P2=_LARGE_STEP,
-        uniquenessRatio=_UNIQUE,
-        speckleWindowSize=_SPECKLE,
-        speckleRange=1,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
+    levels = 16 * int(np.ceil((largest + _BEYOND - _LEAST) / 16))
+    costs = {"blockSize": _BLOCK, "P1": _SMALL_STEP, "P2": _LARGE_STEP}
+    return semi_global(left, right, _LEAST, levels, **costs, uniquenessRatio=_UNIQUE, speckleWindowSize=_SPECKLE)
+
+
+def semi_global(left: np.ndarray, right: np.ndarray, least: int, levels: int, **settings: int) -> np.ndarray:
+    """(H, W) float32 disparities of a rectified pair in sixteenths of a pixel, NaN where there is none.
+
+    Args:
+        left, right: (H, W) uint8.
+        least, levels: the smallest disparity, and how many are searched.
+        **settings: further ones of OpenCV's matcher.
+    """
+    mode = cv2.STEREO_SGBM_MODE_SGBM_3WAY
+    matcher = cv2.StereoSGBM.create(minDisparity=least, numDisparities=levels, speckleRange=1, mode=mode, **settings)
     # It gives none to columns that the whole range of disparities would leave.
-    wide = [cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in halves]
+    wide = [cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
     sixteenths = matcher.compute(*wide)[:, levels:]
-    return np.where(sixteenths >= 16 * _LEAST, sixteenths / 16.0, np.nan)
+    return np.where(sixteenths >= 16 * least, sixteenths / np.float32(16.0), np.float32(np.nan))
 
 
 def patch_disparity_range(dense: np.ndarray, measured: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from sigmaslam.estimation.gaussian import project_covariance
 from sigmaslam.geometry.se3 import nearest_rotation, rigid_motion, rotation_log, se3_exp, se3_inverse
+from sigmaslam.table import Table
 
 # Slices of the error states. The tracker's drift and the error of the last frame perturb from the left in the tracker's
 # world; A and B are perturbed from the right.
@@ -65,7 +66,7 @@ def residuals(expected: np.ndarray, position: np.ndarray, rotation: np.ndarray |
 
 
 @dataclass(frozen=True, slots=True)
-class PosedReadings:
+class PosedReadings(Table):
     """Readings with the tracker's poses at their times.
 
     Attributes:
@@ -82,9 +83,6 @@ class PosedReadings:
     positions: np.ndarray
     rotations: np.ndarray | None
     covariances: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.poses)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.compiled import open_compiled
+from sigmaslam.frontend.patch_disparity_range import semi_global
 
 kernels = open_compiled("reconstruction._depths")
 
@@ -146,25 +147,13 @@ def _seen_by_both(left: np.ndarray, right: np.ndarray, largest: float, speckle: 
 
 def _semi_global(left: np.ndarray, right: np.ndarray, largest: float, speckle: float = 1.0) -> np.ndarray:
     levels = 16 * int(np.ceil((largest - _LEAST) / 16))
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=_LEAST,
-        numDisparities=levels,
-        blockSize=_BLOCK,
-        P1=_SMALL_STEP,
-        P2=_LARGE_STEP,
-        disp12MaxDiff=1,
-        preFilterCap=_CAP,
-        uniquenessRatio=_UNIQUE,
-        speckleWindowSize=round(speckle * _SPECKLE),
-        speckleRange=1,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )
-    # It gives none to columns that the whole range of disparities would leave.
-    wide = [cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    disparity = matcher.compute(*wide)[:, levels:] / np.float32(16.0)
+    costs = {"blockSize": _BLOCK, "P1": _SMALL_STEP, "P2": _LARGE_STEP, "disp12MaxDiff": 1, "preFilterCap": _CAP}
+    speckle_size = round(speckle * _SPECKLE)
+    settings = {**costs, "uniquenessRatio": _UNIQUE, "speckleWindowSize": speckle_size}
+    disparity = semi_global(left, right, _LEAST, levels, **settings)
     # What would lie left of the right image matches its repeated border.
     inside = disparity <= np.arange(left.shape[1], dtype=np.float32)
-    return np.where((disparity >= _LEAST) & inside, disparity, np.float32(np.nan))
+    return np.where(inside, disparity, np.float32(np.nan))
 
 
 def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> DisparityMap:

@@ -1,9 +1,7 @@
 """The page of a check: one HTML file with its findings and the pairs that it looked at."""
 
-import base64
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from sigmaslam.checks.check import Check
@@ -11,7 +9,8 @@ from sigmaslam.checks.eye_matches import draw_rows
 from sigmaslam.checks.finding import verdict, wrong
 from sigmaslam.files import atomic_write_text
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
-from sigmaslam.report.page_parts import load_template, read_asset
+from sigmaslam.report.page_parts import data_url, load_template, read_asset
+from sigmaslam.run_record.frame_pictures import small_jpeg
 
 # Thumbnails, pixels, and how many.
 _WIDTH, _MOST = 640, 4
@@ -51,7 +50,4 @@ def _picture(check: Check, number: int) -> str:
     rows = np.flatnonzero(check.matches.pair == number)
     every = max(1, len(rows) // _SHOWN)
     canvas = draw_rows(left, right, check.matches.select(rows[::every]), ROW_TOLERANCE)
-    scale = min(1.0, _WIDTH / canvas.shape[1])
-    small = cv2.resize(canvas, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+    return data_url(small_jpeg(canvas, _WIDTH, 80))

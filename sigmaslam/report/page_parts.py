@@ -1,5 +1,6 @@
 """What pages are made of: templates, styles and scripts of the package."""
 
+import base64
 from importlib.resources import files
 
 import jinja2
@@ -20,3 +21,8 @@ def load_template(name: str) -> jinja2.Template:
 def read_asset(name: str) -> Markup:
     """A style or a script, which a page holds as it is."""
     return Markup((files("sigmaslam.report") / "assets" / name).read_text(encoding="utf-8"))
+
+
+def data_url(jpeg: bytes) -> str:
+    """A JPEG file as a page holds it."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()

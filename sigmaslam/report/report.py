@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sigmaslam.files import atomic_write_text, printable
-from sigmaslam.report.page_parts import load_template, read_asset
+from sigmaslam.report.page_parts import data_url, load_template, read_asset
 from sigmaslam.report.report_facts import (
     judge,
     list_calibration,
@@ -204,15 +204,11 @@ def _picture(run: RecordedRun, pictures: FramePictures, index: int, row: int, wo
         "is_lost": status in ("lost", "starting") and index in worst,
         "rank": worst.index(index) if index in worst else None,
         "why": f"{status}, {seconds:.2f} s" if not np.isfinite(score) else f"NIS {score:+.1f} σ, {seconds:.2f} s",
-        "left": _data_url(left),
-        "right": _data_url(right) if right else None,
+        "left": data_url(left),
+        "right": data_url(right) if right else None,
         "pixels": pictures.pixels[part],
         "covariance": pictures.covariance[part],
         "probability": pictures.probability[part],
         "inlier": pictures.inlier[part],
         "trail": pictures.trail[part],
     }
-
-
-def _data_url(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()

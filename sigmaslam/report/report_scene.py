@@ -36,7 +36,8 @@ def build_scene(run: RecordedRun, most: int = MAX_POSES, start: float | None = N
     shown = np.union1d(shown, lost[_even(len(lost), most)])
     seconds = run.trajectory.timestamps - (run.frames.columns["timestamp"][0] if start is None else start)
     status = np.array([STATUSES.index(each) for each in run.pose_status], np.uint8)
-    low, high = _extent(run)
+    # Corners of what the view shows.
+    low, high = extent(positions, _placed_points(run), 0.5 * (positions.min(axis=0) + positions.max(axis=0)), 10.0)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
     keyframes, loops = _keyframes(run)
     ellipsoids, chosen = _ellipsoids(run)
@@ -71,16 +72,9 @@ def _even(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64)) if count else np.zeros(0, np.int64)
 
 
-def _extent(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,), (3,) of what the view shows."""
-    path = run.trajectory.positions
-    if run.map is None:
-        return path.min(axis=0), path.max(axis=0)
-    return extent(path, _placed_points(run), 0.5 * (path.min(axis=0) + path.max(axis=0)), 10.0)
-
-
 def _placed_points(run: RecordedRun) -> np.ndarray:
-    assert run.map is not None
+    if run.map is None:
+        return np.zeros((0, 3))
     return transform_points(run.trajectory.poses[-1], run.map.points) if "object" in run.entries else run.map.points
 
 

@@ -15,13 +15,13 @@ _MEND = "run `sigmaslam map reconstruct` again"
 
 
 @dataclass(frozen=True, slots=True)
-class DensePoints:
-    """Points of surfaces.
+class RecordedPoints:
+    """Points of a map, or of surfaces.
 
     Attributes:
-        points: (N, 3) float32 in the world, metres.
-        sigma: (N,) float32 root of the largest eigenvalue of the covariance, metres.
-        intensity: (N,) uint8 grey value.
+        points: (N, 3) in the world, metres.
+        sigma: (N,) root of the largest eigenvalue of the covariance, metres; NaN where it is not known.
+        intensity: (N,) grey value in the images, 0 to 255; NaN where it is not known.
     """
 
     points: np.ndarray
@@ -34,7 +34,7 @@ def write_dense_points(path: Path, points: np.ndarray, sigma: np.ndarray, intens
 
     Args:
         path: of the file.
-        points, sigma, intensity: as of `DensePoints`, of any precision.
+        points, sigma, intensity: as of `RecordedPoints`, of any precision; float32 and uint8 are kept.
     """
     rows = np.unique(np.linspace(0, max(len(points) - 1, 0), min(len(points), MAX_POINTS)).astype(np.int64))
     grey = np.clip(np.rint(intensity[rows]), 0, 255).astype(np.uint8)
@@ -42,11 +42,11 @@ def write_dense_points(path: Path, points: np.ndarray, sigma: np.ndarray, intens
     save_arrays(path, points=metres, sigma=sigmas, intensity=grey)
 
 
-def read_dense_points(path: Path) -> DensePoints:
+def read_dense_points(path: Path) -> RecordedPoints:
     """The content of a dense.npz.
 
     Raises:
         InputError: it is no such file.
     """
     shapes: dict[str, tuple[str | int, ...]] = {"points": ("N", 3), "sigma": ("N",), "intensity": ("N",)}
-    return DensePoints(**load_columns(path, _MEND, shapes, {"intensity": "u"}))
+    return RecordedPoints(**load_columns(path, _MEND, shapes, {"intensity": "u"}))

@@ -185,8 +185,8 @@ class PictureRecorder:
         return _Picture(
             timestamp,
             score,
-            _jpeg(frame.left),
-            b"" if frame.agreeing is not None else _jpeg(frame.right),
+            small_jpeg(frame.left),
+            b"" if frame.agreeing is not None else small_jpeg(frame.right),
             frame.pixels[rows].astype(np.float32),
             frame.covariance[rows].astype(np.float32),
             frame.matches.probability[rows].astype(np.float32),
@@ -210,10 +210,11 @@ def read_pictures(path: Path) -> FramePictures:
     return FramePictures(**arrays)
 
 
-def _jpeg(image: np.ndarray) -> bytes:
-    height, width = image.shape
-    scale = min(1.0, _WIDTH / width)
+def small_jpeg(image: np.ndarray, most: int = _WIDTH, quality: int = _QUALITY) -> bytes:
+    """An image (H, W) or (H, W, 3) as a JPEG file, at most so many pixels wide."""
+    height, width = image.shape[:2]
+    scale = min(1.0, most / width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(encoded)

@@ -53,7 +53,7 @@ class FrameTable:
     def seconds(self) -> np.ndarray:
         """(N,) time since the first frame."""
         timestamps = self.columns["timestamp"]
-        return np.asarray(timestamps - timestamps[0])
+        return np.asarray(timestamps - timestamps[:1])
 
     @property
     def total_milliseconds(self) -> np.ndarray:
@@ -106,6 +106,18 @@ def read_frames(path: Path) -> FrameTable:
         columns={name: _column(path, rows, name) for name in (*COLUMNS, *KEYFRAME_COLUMNS)},
         milliseconds={name.removeprefix("ms_"): _column(path, rows, name) for name in stages},
     )
+
+
+def read_whole_frames(path: Path) -> FrameTable:
+    """The rows that a run has left, maybe none; a last one that was cut off is removed from the file."""
+    content = path.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        with path.open("rb+") as file:
+            file.truncate(whole)
+    if content.count(b"\n") > 1:
+        return read_frames(path)
+    return FrameTable([], [], dict.fromkeys((*COLUMNS, *KEYFRAME_COLUMNS), np.zeros(0)), {})
 
 
 def _column(path: Path, rows: list[dict[str, str]], name: str) -> np.ndarray:

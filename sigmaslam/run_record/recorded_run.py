@@ -11,7 +11,7 @@ from sigmaslam.bounded_files import check_columns, load_arrays, read_json
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
-from sigmaslam.run_record.dense_points import DENSE_NAME, DensePoints, read_dense_points
+from sigmaslam.run_record.dense_points import DENSE_NAME, RecordedPoints, read_dense_points
 from sigmaslam.run_record.evaluated_frames import (
     EVALUATED_FRAMES_NAME,
     EVALUATION_NAME,
@@ -26,21 +26,6 @@ from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, RUN_NAME
 
 REFINED_TRAJECTORY, REFINE_NAME = "trajectory_refined.tum", "refine.json"
 _MAP_NAME = "map.npz"
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedMap:
-    """Points of a map.
-
-    Attributes:
-        points: (M, 3) in the world, metres.
-        sigma: (M,) root of the largest eigenvalue of the covariance, metres; NaN where it is not known.
-        intensity: (M,) grey value in the images, 0 to 255; NaN where it is not known.
-    """
-
-    points: np.ndarray
-    sigma: np.ndarray
-    intensity: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +56,8 @@ class RecordedRun:
     pose_row: np.ndarray
     final: Trajectory | None
     refined: Trajectory | None
-    map: RecordedMap | None
-    dense: DensePoints | None
+    map: RecordedPoints | None
+    dense: RecordedPoints | None
     pictures: FramePictures | None
     entries: dict[str, Any]
     evaluation: dict[str, Any]
@@ -173,7 +158,7 @@ def _read_trajectory(path: Path) -> Trajectory | None:
     return read_tum(path) if path.is_file() else None
 
 
-def _read_map(path: Path) -> RecordedMap | None:
+def _read_map(path: Path) -> RecordedPoints | None:
     """None where there is no map. Maps of earlier versions have no grey values."""
     if not path.is_file():
         return None
@@ -192,7 +177,7 @@ def _read_map(path: Path) -> RecordedMap | None:
     largest = np.full(len(points), np.nan)
     if known.any():
         largest[known] = np.linalg.eigvalsh(covariances[known])[:, -1]
-    return RecordedMap(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], arrays["intensity"][kept])
+    return RecordedPoints(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], arrays["intensity"][kept])
 
 
 def _read_json(path: Path, command: str) -> dict[str, Any]:

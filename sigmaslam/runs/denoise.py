@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import FrameError, InputError
-from sigmaslam.files import atomic_path, check_new_folder, make_folder
+from sigmaslam.files import atomic_write_bytes, check_new_folder, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
-from sigmaslam.progress import open_progress
+from sigmaslam.progress import counted
 from sigmaslam.readers import StereoFrame
 from sigmaslam.readers.images import IMAGE_SUFFIXES, read_grey
 from sigmaslam.readers.pairing import list_images
@@ -37,7 +37,13 @@ class DenoiseSummary:
 
     def describe(self) -> str:
         """Two lines."""
-        return f"{_describe_noise(self.noise)}\n{self.images} images in {self.seconds:.1f} s"
+        noise = self.noise
+        words = [f"sigma {noise.sigma:.2f}"]
+        words += [f"shot noise of {noise.gain:.2f} x signal"] if noise.gain > 0 else []
+        words += [f"quantiser steps of {noise.step:.1f}"] if noise.step > 0 else []
+        words += [f"{100 * noise.impulses:.1f} % of the pixels stuck"] if noise.impulses > 0 else []
+        words += [f"after a blur of {noise.blur:g} px"] if noise.blur > 0 else []
+        return f"Noise: {', '.join(words)} (grey levels)\n{self.images} images in {self.seconds:.1f} s"
 
 
 class StereoFilter:
@@ -89,8 +95,7 @@ def denoise_files(
     follow = SequenceFilter(noise)
     used: NoiseModel | None = noise
     count, seconds = 0, 0.0
-    with open_progress() as progress:
-        task = progress.add_task("images", total=None, note="")
+    with counted("images", None) as done:
         for name, image in _read(source):
             began = time.perf_counter()
             if alone:
@@ -105,9 +110,9 @@ def denoise_files(
             path = out / f"{Path(name).stem}.png"
             if path.exists():
                 raise InputError(f"{source}: {name} and another image would both become {path.name}: rename one")
-            _write(path, result)
+            atomic_write_bytes(path, cv2.imencode(".png", to_bytes(result))[1].tobytes())
             count += 1
-            progress.update(task, completed=count)
+            done()
     if used is None:
         raise InputError(f"{source}: no image; give an image, a folder that holds some, or a video")
     return DenoiseSummary(count, used, seconds)
@@ -146,17 +151,3 @@ def _check_size(image: np.ndarray, name: str) -> None:
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """Grey levels as an 8-bit image stores them."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    with atomic_path(path) as temporary:
-        cv2.imwrite(str(temporary), to_bytes(image))
-
-
-def _describe_noise(noise: NoiseModel) -> str:
-    words = [f"sigma {noise.sigma:.2f}"]
-    words += [f"shot noise of {noise.gain:.2f} x signal"] if noise.gain > 0 else []
-    words += [f"quantiser steps of {noise.step:.1f}"] if noise.step > 0 else []
-    words += [f"{100 * noise.impulses:.1f} % of the pixels stuck"] if noise.impulses > 0 else []
-    words += [f"after a blur of {noise.blur:g} px"] if noise.blur > 0 else []
-    return f"Noise: {', '.join(words)} (grey levels)"

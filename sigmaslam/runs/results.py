@@ -16,7 +16,14 @@ from sigmaslam.files import atomic_write_text, save_array, save_arrays
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
-from sigmaslam.run_record.frame_table import FRAMES_NAME, STATUSES, TRACKED, FrameTable, predicted_poses, read_frames
+from sigmaslam.run_record.frame_table import (
+    FRAMES_NAME,
+    STATUSES,
+    TRACKED,
+    FrameTable,
+    predicted_poses,
+    read_whole_frames,
+)
 from sigmaslam.run_record.inertial_file import describe_gravity, read_inertial_records
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, POSES_NAME, PoseRecords, read_pose_records, write_pose_table
 from sigmaslam.run_record.relative_pose_file import (
@@ -74,14 +81,11 @@ def write_results(
         The summary, and the names of the files that could not be written; the log says why.
     """
     files = _Files(folder)
-    frames = _read_complete_frames(folder / FRAMES_NAME)
+    frames = read_whole_frames(folder / FRAMES_NAME)
     records = read_pose_records(folder)
-    if frames is None:
-        records = records.select(np.zeros(0, np.int64))
-    else:
-        records = records.select(records.timestamp <= frames.columns["timestamp"][-1] + 1e-9)
-    started = len(records) > 0
-    if frames is None or not frames.count(TRACKED):
+    records = records.select(records.timestamp <= frames.columns["timestamp"].max(initial=-np.inf) + 1e-9)
+    started, tracked = len(records) > 0, frames.count(TRACKED)
+    if not tracked:
         # A start that no second frame confirms is none.
         records = records.select(np.zeros(0, np.int64))
     calibration = calibration or _last_calibration(frames)
@@ -101,14 +105,13 @@ def write_results(
     findings = [Finding(**each) for each in run.get("checks", ())]
     verdict = "Nothing is known of the calibration: no frame was tracked."
     if calibration is not None and (len(records) or wrong(findings)):
-        tracked = frames.count(TRACKED) if frames is not None else 0
         verdict = calibration_verdict(calibration, tracked, points, expected_offset(run["calibration"]), findings)
     summary = {**_summarise(frames, records, calibration, points), "calibration_verdict": verdict}
     if tracker is None:
         # Of a first attempt, if there was one.
         known = ("calibration_verdict", "calibration_errors")
         summary |= {name: value for name, value in run.get("summary", {}).items() if name in known}
-    if frames is not None and len(records):
+    if len(records):
         summary |= describe_gravity(read_inertial_records(folder), records)
         if tracker is not None and tracker.judge_imu is not None:
             by_images = ~predicted_poses(frames, records.timestamp)
@@ -118,8 +121,10 @@ def write_results(
     summary["failure"] = explain_failure(summary, run.get("map") is not None, started, findings)
     content = json.dumps({**run, "summary": summary}, indent=2) + "\n"
     files.attempt(RUN_NAME, lambda path: atomic_write_text(path, content))
-    if frames is not None:
-        files.attempt(REPORT_NAME, _write_report)
+    if len(frames):
+        from sigmaslam.report.report import write_report  # not needed before the run has ended
+
+        files.attempt(REPORT_NAME, lambda path: write_report(path.parent))
     of_folder += [name for name in files.failed if name in (RUN_NAME, REPORT_NAME)]
     if not of_folder:
         for name in (PARTIAL_POSES, PARTIAL_RELATIVE_POSES):
@@ -144,7 +149,7 @@ class _Files:
         self.failed: list[str] = []
         self._folder = folder
 
-    def attempt(self, name: str, write: Callable[[Path], None]) -> None:
+    def attempt(self, name: str, write: Callable[[Path], object]) -> None:
         """Writes one."""
         try:
             write(self._folder / name)
@@ -156,20 +161,8 @@ class _Files:
             self.failed.append(name)
 
 
-def _read_complete_frames(path: Path) -> FrameTable | None:
-    """The rows of frames.csv; a last one that was cut off is removed from the file. None without a row."""
-    content = path.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if whole < len(content):
-        with path.open("rb+") as file:
-            file.truncate(whole)
-    return read_frames(path) if content.count(b"\n") > 1 else None
-
-
-def _last_calibration(frames: FrameTable | None) -> CalibrationEstimate | None:
+def _last_calibration(frames: FrameTable) -> CalibrationEstimate | None:
     """What frames.csv says of it; other errors than the disparity offset are not on disk."""
-    if frames is None:
-        return None
     offset, sigma = (frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma"))
     said = np.flatnonzero(np.isfinite(offset))
     if not len(said):
@@ -177,8 +170,8 @@ def _last_calibration(frames: FrameTable | None) -> CalibrationEstimate | None:
     return CalibrationEstimate(float(offset[said[-1]]), float(sigma[said[-1]]))
 
 
-def _write_poses(files: _Files, records: PoseRecords, frames: FrameTable | None, has_matching: bool) -> None:
-    if frames is None or not len(records):
+def _write_poses(files: _Files, records: PoseRecords, frames: FrameTable, has_matching: bool) -> None:
+    if not len(records):
         return
     trajectory = Trajectory(records.timestamp, records.pose)
     files.attempt("trajectory.tum", lambda path: write_tum(path, trajectory))
@@ -223,33 +216,29 @@ def _write_map(files: _Files, tracker: TrackerResults) -> int:
     return len(made[0].points)
 
 
-def _write_report(path: Path) -> None:
-    from sigmaslam.report.report import write_report  # not needed before the run has ended
-
-    write_report(path.parent)
-
-
 def _summarise(
-    frames: FrameTable | None, records: PoseRecords, calibration: CalibrationEstimate | None, points: int
+    frames: FrameTable, records: PoseRecords, calibration: CalibrationEstimate | None, points: int
 ) -> dict[str, Any]:
     """Counts for run.json."""
-    inliers = np.zeros(0) if frames is None else frames.columns["inliers"]
-    inliers = inliers[inliers > 0]
-    first = None
-    if frames is not None and len(records):
-        first = int(np.abs(frames.columns["timestamp"] - records.timestamp[0]).argmin())
+    columns, status = frames.columns, np.array(frames.status, str)
+    inliers = columns["inliers"][columns["inliers"] > 0]
+    first = int(np.abs(columns["timestamp"] - records.timestamp[0]).argmin()) if len(records) else None
+    # Of tracked frames, that fewer than half of the matches agree with the pose; of skipped ones that could be read,
+    # that one of their images is that of the frame before.
+    contradicted = np.isin(status, TRACKED) & (2.0 * columns["inliers"] < columns["matches"])
+    repeated = (status == "skipped") & np.isfinite(columns["belief"])
     return {
-        "frames": 0 if frames is None else len(frames),
-        **{status: 0 if frames is None else frames.status.count(status) for status in STATUSES},
-        "tracked": 0 if frames is None else frames.count(TRACKED),
-        "doubts": {} if frames is None else _count_doubts(frames),
+        "frames": len(frames),
+        **{each: frames.status.count(each) for each in STATUSES},
+        "tracked": frames.count(TRACKED),
+        "doubts": _count_doubts(frames),
         "poses": len(records),
         "first_frame_with_pose": first,
         "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
         "map_points": points,
-        "contradicted": 0 if frames is None else _count_contradicted(frames),
-        "stamp_noise": 0.0 if frames is None else stamp_noise(np.diff(frames.columns["timestamp"])),
-        "repeated": 0 if frames is None else _count_repeated(frames),
+        "contradicted": int(contradicted.sum()),
+        "stamp_noise": stamp_noise(np.diff(columns["timestamp"])),
+        "repeated": int(repeated.sum()),
         "calibration_errors": {} if calibration is None else {k: list(v) for k, v in calibration.errors.items()},
     }
 
@@ -261,18 +250,6 @@ def _count_doubts(frames: FrameTable) -> dict[str, dict[str, float]]:
         for reason in doubts:
             counts.setdefault(reason, {"frames": 0, "first": seconds})["frames"] += 1
     return counts
-
-
-def _count_contradicted(frames: FrameTable) -> int:
-    """Tracked frames whose pose fewer than half of the matches agree with."""
-    tracked = np.isin(frames.status, TRACKED)
-    return int((tracked & (2.0 * frames.columns["inliers"] < frames.columns["matches"])).sum())
-
-
-def _count_repeated(frames: FrameTable) -> int:
-    """Frames that were skipped though they could be read: one of their images is that of the frame before."""
-    skipped = np.array(frames.status) == "skipped"
-    return int((skipped & np.isfinite(frames.columns["belief"])).sum())
 
 
 def _describe_world(summary: dict[str, Any], run: dict[str, Any]) -> str | None:

@@ -18,7 +18,7 @@ from sigmaslam.files import atomic_write_text
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
 from sigmaslam.run_record.appended_file import check_not_in_use
-from sigmaslam.run_record.frame_table import FRAMES_NAME, read_frames
+from sigmaslam.run_record.frame_table import FRAMES_NAME, read_whole_frames
 from sigmaslam.run_record.inertial_file import cut_inertial_records
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records, write_pose_records
 from sigmaslam.run_record.relative_pose_file import (
@@ -135,7 +135,8 @@ def read_stopped_run(folder: Path, run: dict[str, Any]) -> StoppedRun:
     entries = read_json(path, "the run", "track anew with --overwrite")
     _check_entries(folder, entries, json.loads(json.dumps(run)))
     records, pairs = _read_poses(folder)
-    times, keyframe = _read_rows(folder / FRAMES_NAME)
+    frames = read_whole_frames(folder / FRAMES_NAME)
+    times, keyframe = frames.columns["timestamp"], frames.columns["keyframe"] == 1
     # Of the last frame that is whole in all files; a kill, or a power cut, leaves one ahead of the other.
     posed = np.flatnonzero(_is_among(times, records.timestamp))
     keyframes = posed[keyframe[posed]]
@@ -190,14 +191,3 @@ def _is_among(times: np.ndarray, others: np.ndarray) -> np.ndarray:
         return np.zeros(len(times), bool)
     nearest = others[np.searchsorted(0.5 * (others[1:] + others[:-1]), times)]
     return np.asarray(np.abs(nearest - times) < _SAME_TIME)
-
-
-def _read_rows(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Time stamps (N,) of the whole rows of frames.csv, and which are keyframes (N,)."""
-    content = path.read_bytes()
-    if content.count(b"\n") < 2:
-        return np.zeros(0), np.zeros(0, bool)
-    if not content.endswith(b"\n"):
-        atomic_write_text(path, content[: content.rfind(b"\n") + 1].decode("utf-8"))
-    frames = read_frames(path)
-    return frames.columns["timestamp"], frames.columns["keyframe"] == 1

@@ -110,10 +110,11 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
             "ended": _describe_end(stopped_by),
             "dropped": timing.dropped + sequence.dropped,
             **timing.describe(timing.dropped + sequence.dropped),
-            **_describe_object(tracker, options.track_object),
             **_describe_location(location),
             **({} if images is None else {"noise": images.describe()}),
         }
+        if isinstance(tracker, ObjectTracker):
+            run["object"] = run["object"] | {"origin": tracker.origin.tolist()}  # in the first left camera's frame
         others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
         if location is not None and (placed := location.trajectory()) is not None:
             others["trajectory_location.tum"] = lambda path: write_tum(path, placed)
@@ -185,13 +186,6 @@ def _build_tracker(
         )
     region = read_region(options.track_object, camera.left.width, camera.left.height)
     return ObjectTracker(camera, region, frontend, backend, config, threads, provider, weights)
-
-
-def _describe_object(tracker: Tracker, track_object: str | None) -> dict[str, Any]:
-    """Entries of run.json for a followed body: its region, and the origin of its frame in the first left camera's."""
-    if not isinstance(tracker, ObjectTracker):
-        return {}
-    return {"object": {"region": track_object, "origin": tracker.origin.tolist()}}
 
 
 def _describe_location(location: LocationFilter | None) -> dict[str, Any]:

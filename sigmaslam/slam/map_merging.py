@@ -19,7 +19,7 @@ from sigmaslam.frontend import build_frontend
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import nearest_rigid, se3_inverse, se3_log, turn_covariance
-from sigmaslam.progress import open_progress
+from sigmaslam.progress import counted
 from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe, from_origin
@@ -135,8 +135,7 @@ def _find(one: MapFile, other: MapFile) -> Found:
     for each in one.known:
         appearance.add(each.id, each.descriptors)
     links = []
-    with open_progress() as progress:
-        task = progress.add_task("keyframes", total=len(other.known), note="")
+    with counted("keyframes", len(other.known)) as done:
         for each in other.known:
             view = each.view
             for candidate in retrieve(view, _CANDIDATES, one.known, appearance):
@@ -146,7 +145,7 @@ def _find(one: MapFile, other: MapFile) -> Found:
                     spread = turn_covariance(at.T_key_camera, at.covariance)
                     links.append((each, Link(candidate.origin, at.T_key_camera, spread, int(at.inliers.sum()))))
                     break
-            progress.advance(task)
+            done()
     links.sort(key=lambda pair: -pair[1].inliers)
     for first, second in itertools.combinations(links, 2):
         if _agree(one, other, first, second):

@@ -123,11 +123,12 @@ def _best(matches: _StereoMatches, candidates: list[np.ndarray | None]) -> Relat
     guesses = [guess for guess in candidates if guess is not None and np.isfinite(guess).all()]
     if not guesses:
         return None
-    scale = min(_variance_scale(matches.weight, _squared_errors(matches, guess)) for guess in guesses)
+    # Squared errors do not depend on the loss.
+    scale = min(_variance_scale(matches.weight, matches.equations(guess, 1.0)[0]) for guess in guesses)
     refined = [T for guess in guesses if (T := _refine_pose(matches, guess, scale)) is not None]
     if not refined:
         return None
-    errors = [_squared_errors(matches, T) for T in refined]
+    errors = [matches.equations(T, 1.0)[0] for T in refined]
     scale = min(_variance_scale(matches.weight, squared) for squared in errors)
     # The misfit weights the squared errors, each limited to the gate.
     misfit = [float(matches.weight @ np.minimum(squared / scale, CHI_SQUARE_999[3])) for squared in errors]
@@ -272,11 +273,6 @@ def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: fl
         T_camera_key = se3_exp(np.linalg.solve(normal, gradient)) @ T_camera_key
         scale = max(_NARROWING * scale, _LAST_SCALE)
     return T_camera_key
-
-
-def _squared_errors(matches: _StereoMatches, T_camera_key: np.ndarray) -> np.ndarray:
-    """Squared errors (M,) in sigmas; infinite for points behind the camera."""
-    return matches.equations(T_camera_key, 1.0)[0]
 
 
 def _variance_scale(weight: np.ndarray, squared: np.ndarray) -> float:

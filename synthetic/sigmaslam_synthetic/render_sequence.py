@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from sigmaslam.errors import InputError, OutputError
-from sigmaslam.files import atomic_path, atomic_write_text, check_new_folder
+from sigmaslam.files import atomic_write_bytes, atomic_write_text, check_new_folder
 from sigmaslam_synthetic.landmark_tracks import Landmarks, choose_landmarks, observe
 from sigmaslam_synthetic.layouts import image_paths, save_arrays, write_inertial, write_layout
 from sigmaslam_synthetic.parallel_jobs import list_failures, run_jobs
@@ -58,7 +58,8 @@ def write_sequence(
         raise InputError(f"truth {truth!r} is unknown; choose one of {', '.join(TRUTHS)}")
     recipe.check()
     prepare(out, recipe, truth)
-    missing = missing_frames(out, recipe.frames)
+    # The truth of a frame is the last of its files.
+    missing = [k for k in range(recipe.frames) if not _truth_path(out, k).is_file()]
     before = recipe.frames - len(missing)
     done(before)
     size = int(np.clip(len(missing) // (4 * workers), 1, _CHUNK))
@@ -159,11 +160,6 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> None:
     begun.unlink()
 
 
-def missing_frames(out: Path, frames: int) -> list[int]:
-    """Numbers of the frames whose truth, the last of their files, is not there."""
-    return [k for k in range(frames) if not _truth_path(out, k).is_file()]
-
-
 def write_frames(out: Path, studio: Studio, landmarks: Landmarks, truth: str, numbers: list[int]) -> int:
     """Renders and writes these frames; returns how many."""
     batch = 1 if studio.renderer.device.type == "cpu" else _CHUNK
@@ -173,7 +169,7 @@ def write_frames(out: Path, studio: Studio, landmarks: Landmarks, truth: str, nu
         frames = studio.frames(np.array(part), (left, right))
         for view, (number, frame) in enumerate(zip(part, frames, strict=True)):
             for path, image in zip(image_paths(out, studio.simulation, number), (frame.left, frame.right), strict=True):
-                _write_image(path, image)
+                atomic_write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
             tracks = observe(landmarks, left.sight, right.sight, view)
             save_arrays(_truth_path(out, number), _truth_of(tracks, frame, truth))
     return len(numbers)
@@ -263,14 +259,6 @@ def _truth_of(observed: dict[str, np.ndarray], frame: Frame, truth: str) -> dict
 
 def _truth_path(out: Path, frame: int) -> Path:
     return out / "truth" / f"{frame:06d}.npz"
-
-
-def _write_image(path: Path, image: np.ndarray) -> None:
-    ok, encoded = cv2.imencode(".png", image)
-    if not ok:
-        raise InputError(f"{path} cannot be encoded as PNG")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
 
 
 def default_workers() -> int:

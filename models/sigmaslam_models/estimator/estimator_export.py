@@ -68,11 +68,11 @@ def estimator_graphs() -> dict[str, TracedModule]:
             ["predicted_pose", "predicted_velocity", "predicted_covariance", "carried"],
             (fixed,) * 12,
         ),
-        "frame_predict": _frame_graph(PredictViews(), (), PREDICTED),
-        "frame_robust": _frame_graph(RobustStep(), ROBUST_INPUTS, ROBUST_OUTPUTS),
-        "frame_gated": _frame_graph(GatedStep(), GATED_INPUTS, GATED_OUTPUTS),
-        "window_eliminate": _window_graph(EliminateLandmarks(), WINDOW_INPUTS, WINDOW_OUTPUTS),
-        "window_gate": _window_graph(GateWindow(), (), ("agree",)),
+        "frame_predict": _step_graph(PredictViews(), (), PREDICTED, of_frame=True),
+        "frame_robust": _step_graph(RobustStep(), ROBUST_INPUTS, ROBUST_OUTPUTS, of_frame=True),
+        "frame_gated": _step_graph(GatedStep(), GATED_INPUTS, GATED_OUTPUTS, of_frame=True),
+        "window_eliminate": _step_graph(EliminateLandmarks(), WINDOW_INPUTS, WINDOW_OUTPUTS, of_frame=False),
+        "window_gate": _step_graph(GateWindow(), (), ("agree",), of_frame=False),
         "window_condition": TracedModule(
             Condition(),
             condition_example(0, 18, 7),
@@ -84,23 +84,15 @@ def estimator_graphs() -> dict[str, TracedModule]:
     }
 
 
-def _frame_graph(module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> TracedModule:
-    """A step of a frame's update with inputs of its own, before the fields of `FrameViews`."""
-    fields = FrameViews._fields
-    traced, checked = (
-        frame_example(seed, keyframes, count, *inputs, *fields) for seed, keyframes, count in ((0, 3, 40), (1, 5, 77))
-    )
-    axes = (*frame_axes(*inputs), frame_axes(*fields))
-    return TracedModule(module, traced, checked, [*inputs, *fields], list(outputs), axes)
-
-
-def _window_graph(module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> TracedModule:
-    """A step of a window's solution with inputs of its own, before the fields of `WindowViews`."""
-    fields = WindowViews._fields
-    traced, checked = (
-        window_example(seed, keyframes, count, *inputs, *fields) for seed, keyframes, count in ((0, 4, 30), (1, 5, 50))
-    )
-    axes = (*window_axes(*inputs), window_axes(*fields))
+def _step_graph(
+    module: nn.Module, inputs: tuple[str, ...], outputs: tuple[str, ...], *, of_frame: bool
+) -> TracedModule:
+    """A step of a frame's update, or of a window's solution, with inputs of its own before the fields of its views."""
+    fields = FrameViews._fields if of_frame else WindowViews._fields
+    example, axes_of = (frame_example, frame_axes) if of_frame else (window_example, window_axes)
+    sizes = ((3, 40), (5, 77)) if of_frame else ((4, 30), (5, 50))
+    traced, checked = (example(seed, *size, *inputs, *fields) for seed, size in enumerate(sizes))
+    axes = (*axes_of(*inputs), axes_of(*fields))
     return TracedModule(module, traced, checked, [*inputs, *fields], list(outputs), axes)
 
 
