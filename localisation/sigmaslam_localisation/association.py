@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sigmaslam_filters import BayesFilter, Diagonal, Gaussian, several
 from sigmaslam_localisation.localise import FilterName, make_filter
-from sigmaslam_localisation.mapping_robot import MappingRobot
+from sigmaslam_localisation.mapping_robot import MappingRobot, origin_near
 from sigmaslam_localisation.recording import Recording
 from sigmaslam_localisation.robot_step import RobotStep
 from sigmaslam_localisation.robots import first_poses
@@ -121,7 +121,9 @@ class Association:
         self._scale = torch.ones(len(start), 2, dtype=torch.float64)
         self._platform: WheeledRobot | MappingRobot = robot
         self._bayes: BayesFilter = make_filter(name, SPACE)
+        self._origin = origin_near(start)
         if places is None:
+            self._belief = MappingRobot(robot, 0, self._origin).enter(self._belief)
             self._grow(0)
 
     def run(self, tell: Callable[[float], None]) -> None:
@@ -199,7 +201,7 @@ class Association:
         """A map of so many landmarks; those beyond what is known stand at the origin, independent of all."""
         if isinstance(self._platform, MappingRobot) and self._platform.landmarks == landmarks:
             return
-        self._platform = MappingRobot(self._robot, landmarks)
+        self._platform = MappingRobot(self._robot, landmarks, self._origin)
         self._bayes = make_filter(self._name, self._platform.space)
         before, size = self._belief, self._platform.space.tangent_size
         more = size - before.covariance.shape[-1]

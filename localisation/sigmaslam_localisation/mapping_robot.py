@@ -4,6 +4,11 @@ The state is that of `WheeledRobot`, then the places x, y of all landmarks in th
 sighting is of is known. A landmark that was not seen yet stands at the origin, independent of all else, and has no part
 in anything; its first sighting puts it into its place, by the inverse of (9.45), with the covariances that the robot's
 pose, the constants and the sighting's noise give it, the cross covariances among them.
+
+No sighting says where the world's frame is, how it is turned, or how long its metre is. A filter whose tangents are
+changes of x, y and heading forgets that: the tangent of a turned world depends on the estimate, and updates at
+different estimates add up to information that no sighting gave (Julier and Uhlmann 2001). In `MapSpace` what cannot be
+seen is the same tangent at all estimates, as in the invariant filter of Barrau and Bonnabel (2015).
 """
 
 from dataclasses import dataclass
@@ -11,12 +16,92 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sigmaslam_filters import BayesFilter, Diagonal, Euclidean, Gaussian, MeasurementModel, MotionModel, Product
+from sigmaslam_filters import BayesFilter, Diagonal, Gaussian, MeasurementModel, MotionModel
 from sigmaslam_filters.core.layout import concatenate
-from sigmaslam_localisation.wheeled_robot import BODY, CONSTANTS, WheeledRobot
+from sigmaslam_filters.manifolds.lie_groups import Pair, exp_se2, log_se2, turn, wrap_angle
+from sigmaslam_filters.manifolds.spaces import Manifold
+from sigmaslam_filters.manifolds.tangent_maps import tangent_maps
+from sigmaslam_localisation.wheeled_robot import BODY, CONSTANTS, SPACE, WheeledRobot
 
 ROBOT_SIZE = BODY.point_size + len(CONSTANTS)
 """Components of a state before the landmarks, in points and in tangents."""
+
+
+@dataclass(frozen=True)
+class MapSpace(Manifold):
+    """States as points; tangents are twists that move the sensor and the landmarks, in units of the sensor's metre.
+
+    A tangent has a translation of the sensor, a turn about the origin, which is that of all, the constants' changes,
+    and a translation of each landmark. Of the group of these motions tangents are carried from one point to another as
+    they are (`parallel`), as otherwise a turn at one estimate would be another motion at the next.
+
+    Attributes:
+        lever: metres by which the sensor is said to stand ahead of the robot's centre.
+        landmarks: how many there are.
+        origin: x, y in the world, metres, near the robot for the sake of round-off.
+    """
+
+    lever: float
+    landmarks: int
+    origin: tuple[float, float]
+    parallel = True
+
+    @property
+    def point_size(self) -> int:
+        """Length of a point."""
+        return ROBOT_SIZE + 2 * self.landmarks
+
+    @property
+    def tangent_size(self) -> int:
+        """Length of a tangent."""
+        return self.point_size
+
+    def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
+        angle = tangent[..., 2:3]
+        places, heading = self._sensed(point)
+        x, y = turn(torch.sin(angle), torch.cos(angle), places)
+        a, b = exp_se2(_columns(tangent), angle)
+        constants = point[..., 3:ROBOT_SIZE] + tangent[..., 3:ROBOT_SIZE]
+        scale = 1.0 + constants[..., 6:7]
+        places = (x + a) / scale + self.origin[0], (y + b) / scale + self.origin[1]
+        return self._at_lever(_joined(places, wrap_angle(heading + angle + constants[..., 5:6]), constants), -1.0)
+
+    def _local(self, point: Tensor, other: Tensor) -> Tensor:
+        (places, heading), ((a, b), other_heading) = self._sensed(point), self._sensed(other)
+        angle = wrap_angle(other_heading - heading)
+        x, y = turn(torch.sin(angle), torch.cos(angle), places)
+        constants = other[..., 3:ROBOT_SIZE] - point[..., 3:ROBOT_SIZE]
+        return _joined(log_se2((a - x, b - y), angle), angle, constants)
+
+    def _sensed(self, point: Tensor) -> tuple[Pair, Tensor]:
+        """Places (..., 1 + M) of sensor and landmarks from the origin, in the sensor's metre; its heading (..., 1)."""
+        scale, (x, y) = 1.0 + point[..., 9:10], _columns(self._at_lever(point, 1.0))
+        return (scale * (x - self.origin[0]), scale * (y - self.origin[1])), point[..., 2:3] - point[..., 8:9]
+
+    def _at_lever(self, point: Tensor, sign: float) -> Tensor:
+        """The point with the place of the sensor in that of the robot, or back again by a sign of -1."""
+        heading = point[..., 2:3]
+        lever = turn(torch.sin(heading), torch.cos(heading), (self.lever + point[..., 10:11], point[..., 11:12]))
+        return torch.cat([point[..., :2] + sign * torch.cat(lever, dim=-1), point[..., 2:]], dim=-1)
+
+
+def origin_near(poses: Tensor) -> tuple[float, float]:
+    """x, y of the mean of poses (B, 3)."""
+    x, y, _ = poses.mean(dim=0).tolist()
+    return x, y
+
+
+def _columns(vector: Tensor) -> Pair:
+    """First and second coordinates (..., 1 + M) of the robot and of all landmarks."""
+    x, y = (torch.cat([vector[..., i : i + 1], vector[..., ROBOT_SIZE + i :: 2]], dim=-1) for i in (0, 1))
+    return x, y
+
+
+def _joined(columns: Pair, angle: Tensor, constants: Tensor) -> Tensor:
+    """The inverse of `_columns`, with an angle (..., 1) and the constants."""
+    places = torch.stack(columns, dim=-1).flatten(-2)
+    middle = torch.cat([angle, constants], dim=-1).expand(*places.shape[:-1], -1)
+    return torch.cat([places[..., :2], middle, places[..., 2:]], dim=-1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,23 +111,28 @@ class MappingRobot:
     Attributes:
         robot: its own models.
         landmarks: how many there are.
+        origin: see `MapSpace`.
     """
 
     robot: WheeledRobot
     landmarks: int
+    origin: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def space(self) -> Product:
-        """SE(2) x R^(9 + 2 landmarks)."""
-        return Product(BODY, Euclidean(len(CONSTANTS) + 2 * self.landmarks))
+    def space(self) -> MapSpace:
+        """Of the state."""
+        return MapSpace(self.robot.lever, self.landmarks, self.origin)
 
-    def prior(self, start: Tensor) -> Gaussian:
-        """The belief at the first pose (..., 3), before any landmark was seen."""
-        alone = self.robot.prior(start)
+    def enter(self, alone: Gaussian) -> Gaussian:
+        """The belief of a robot on `SPACE`, before any landmark was seen."""
         size = 2 * self.landmarks
+        maps = tangent_maps(MapSpace(self.robot.lever, 0, self.origin))
+        point = alone.mean[..., None, :]
+        along = torch.eye(ROBOT_SIZE, dtype=point.dtype).expand(*point.shape[:-2], -1, -1)
+        change = maps.push_local(point, SPACE.push_retract(point, along)).mT
         mean = torch.nn.functional.pad(alone.mean, (0, size))
         covariance = torch.eye(ROBOT_SIZE + size, dtype=mean.dtype).repeat(*mean.shape[:-1], 1, 1)
-        covariance[..., :ROBOT_SIZE, :ROBOT_SIZE] = alone.covariance
+        covariance[..., :ROBOT_SIZE, :ROBOT_SIZE] = change @ alone.covariance @ change.mT
         return Gaussian(mean, covariance)
 
     def motion(self, path: Tensor, duration: Tensor) -> MotionModel:

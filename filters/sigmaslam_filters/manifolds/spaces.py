@@ -76,6 +76,11 @@ class Manifold(ABC):
         """Whether retract is addition and local is subtraction."""
         return False
 
+    @property
+    def parallel(self) -> bool:
+        """Whether a filter carries a covariance from one point to another as it is, as invariant filters do."""
+        return False
+
     def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         """The point that a tangent leads to, point [+] tangent: (..., p), (..., n) -> (..., p)."""
         self._check("point", point, self.point_size)
