@@ -11,7 +11,9 @@ different estimates add up to information that no sighting gave (Julier and Uhlm
 seen is the same tangent at all estimates, as in the invariant filter of Barrau and Bonnabel (2015).
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -85,16 +87,10 @@ class MapSpace(Manifold):
         return torch.cat([point[..., :2] + sign * torch.cat(lever, dim=-1), point[..., 2:]], dim=-1)
 
 
-def origin_near(poses: Tensor) -> tuple[float, float]:
-    """x, y of the mean of poses (B, 3)."""
-    x, y, _ = poses.mean(dim=0).tolist()
-    return x, y
-
-
 def _columns(vector: Tensor) -> Pair:
     """First and second coordinates (..., 1 + M) of the robot and of all landmarks."""
-    x, y = (torch.cat([vector[..., i : i + 1], vector[..., ROBOT_SIZE + i :: 2]], dim=-1) for i in (0, 1))
-    return x, y
+    places = torch.cat([vector[..., :2], vector[..., ROBOT_SIZE:]], dim=-1)
+    return places[..., 0::2], places[..., 1::2]
 
 
 def _joined(columns: Pair, angle: Tensor, constants: Tensor) -> Tensor:
@@ -105,52 +101,54 @@ def _joined(columns: Pair, angle: Tensor, constants: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class MappingRobot:
+class MappingRobot(WheeledRobot):
     """Models of a robot whose state holds the landmarks.
 
     Attributes:
-        robot: its own models.
         landmarks: how many there are.
         origin: see `MapSpace`.
     """
 
-    robot: WheeledRobot
-    landmarks: int
+    landmarks: int = 0
     origin: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of_robot(cls, robot: WheeledRobot, landmarks: int, poses: Tensor) -> MappingRobot:
+        """The robot with so many landmarks, near its first poses (B, 3)."""
+        x, y, _ = poses.mean(dim=0).tolist()
+        return cls(robot.kind, robot.lever, robot.noise, landmarks, (x, y))
 
     @property
     def space(self) -> MapSpace:
         """Of the state."""
-        return MapSpace(self.robot.lever, self.landmarks, self.origin)
+        return MapSpace(self.lever, self.landmarks, self.origin)
 
     def enter(self, alone: Gaussian) -> Gaussian:
         """The belief of a robot on `SPACE`, before any landmark was seen."""
-        size = 2 * self.landmarks
-        maps = tangent_maps(MapSpace(self.robot.lever, 0, self.origin))
+        maps = tangent_maps(replace(self.space, landmarks=0))
         point = alone.mean[..., None, :]
         along = torch.eye(ROBOT_SIZE, dtype=point.dtype).expand(*point.shape[:-2], -1, -1)
         change = maps.push_local(point, SPACE.push_retract(point, along)).mT
-        mean = torch.nn.functional.pad(alone.mean, (0, size))
-        covariance = torch.eye(ROBOT_SIZE + size, dtype=mean.dtype).repeat(*mean.shape[:-1], 1, 1)
-        covariance[..., :ROBOT_SIZE, :ROBOT_SIZE] = change @ alone.covariance @ change.mT
-        return Gaussian(mean, covariance)
+        return self.grow(Gaussian(alone.mean, change @ alone.covariance @ change.mT))
 
-    def motion(self, path: Tensor, duration: Tensor) -> MotionModel:
-        """As the robot's; the landmarks stand still."""
-        return self.robot.motion(path, duration)
+    def grow(self, belief: Gaussian) -> Gaussian:
+        """A belief of fewer landmarks; those beyond them stand at the origin, independent of all."""
+        before = belief.covariance
+        more = self.space.point_size - before.shape[-1]
+        covariance = torch.eye(self.space.point_size, dtype=before.dtype).repeat(*before.shape[:-2], 1, 1)
+        covariance[..., : before.shape[-1], : before.shape[-1]] = before
+        return Gaussian(torch.nn.functional.pad(belief.mean, (0, more)), covariance)
 
     def measurement(self) -> MeasurementModel:
         """Sighting of the landmark whose number is the input (..., 1), of unit noise."""
-        known = self.robot.measurement()
+        known = WheeledRobot.measurement(self)
 
         def see(state: Tensor, landmark: Tensor) -> Tensor:
-            return known.function(state, _places(state, landmark))
+            index = ROBOT_SIZE + 2 * landmark.long() + torch.arange(2)
+            batch = torch.broadcast_shapes(state.shape[:-1], index.shape[:-1])
+            return known.function(state, state.expand(*batch, -1).gather(-1, index.expand(*batch, -1)))
 
         return MeasurementModel(see, known.noise, residual=known.residual)
-
-    def variance(self, value: Tensor) -> Tensor:
-        """As the robot's."""
-        return self.robot.variance(value)
 
     def admit(
         self, bayes: BayesFilter, belief: Gaussian, value: Tensor, variance: Tensor, landmark: Tensor, new: Tensor
@@ -176,17 +174,9 @@ class MappingRobot:
 
     def _put(self, state: Tensor, noise: Tensor, value: Tensor, landmark: Tensor) -> Tensor:
         """The state with the landmark of that number (..., 1) where a sighting says; unchanged for -1."""
-        place = self.robot.place(state, value + noise)
+        place = self.place(state, value + noise)
         numbers = torch.arange(self.landmarks).repeat_interleave(2)
         places = torch.where(
             numbers == landmark, place.repeat(*[1] * (place.ndim - 1), self.landmarks), state[..., ROBOT_SIZE:]
         )
         return concatenate([state[..., :ROBOT_SIZE].expand(*places.shape[:-1], -1), places])
-
-
-def _places(state: Tensor, landmark: Tensor) -> Tensor:
-    """Places (..., 2) in the states of the landmarks with these numbers (..., 1)."""
-    first = ROBOT_SIZE + 2 * landmark.long()
-    index = torch.cat([first, first + 1], dim=-1)
-    batch = torch.broadcast_shapes(state.shape[:-1], index.shape[:-1])
-    return torch.gather(state.expand(*batch, -1), -1, index.expand(*batch, -1))

@@ -14,7 +14,7 @@ from sigmaslam_filters import Gaussian, degree_of_belief
 from sigmaslam_filters.manifolds import Space
 from sigmaslam_filters.manifolds.tangent_maps import tangent_maps
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
-from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot, MapSpace, origin_near
+from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot, MapSpace
 from sigmaslam_localisation.recording import PlanarTruth, Recording
 from sigmaslam_localisation.robot_step import Platform
 from sigmaslam_localisation.smoothing import Smoother
@@ -112,14 +112,11 @@ def localise_robots(
     repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
     platform: Platform = robot
     space: Space = SPACE
-    admit = None
     if mapping:
-        mapper = MappingRobot(robot, max(len(each.landmarks) for each in recordings), origin_near(starts))
-        platform, space, admit, repeated = mapper, mapper.space, mapper.admit, mapper.enter(repeated)
+        mapper = MappingRobot.of_robot(robot, max(len(each.landmarks) for each in recordings), starts)
+        platform, space, repeated = mapper, mapper.space, mapper.enter(repeated)
     bayes = make_filter(filter_name, space)
-    first = localise(
-        bayes, platform, repeated, steps, None, lambda done: tell(f"first pass: {done:.0%}"), admit, ROBOT_SIZE
-    )
+    first = localise(bayes, platform, repeated, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
     best = first.log_likelihood.reshape(-1, count).argmax(axis=1)
     chosen = np.arange(len(recordings)) * count + best
     delays = [DELAYS[index] for index in best]
@@ -130,15 +127,7 @@ def localise_robots(
     prior = mapper.enter(prior) if mapping else prior
     scale = torch.from_numpy(first.scale[-1, chosen])
     second = localise(
-        bayes,
-        platform,
-        prior,
-        steps,
-        scale,
-        lambda done: tell(f"second pass: {done:.0%}"),
-        admit,
-        ROBOT_SIZE,
-        lag is not None,
+        bayes, platform, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"), lag is not None
     )
     estimates = _estimates(recordings, delays, steps, second, np.arange(len(recordings)), space)
     if lag is None:

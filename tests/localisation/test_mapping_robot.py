@@ -36,7 +36,7 @@ def correlated_belief(generator, mapping, batch=()):
 @pytest.mark.long
 def test_a_landmark_enters_with_its_cross_covariance():
     """Against derivatives by central differences of an independent inverse of the sensor."""
-    mapping = MappingRobot(WheeledRobot("range-bearing", 0.2), 3)
+    mapping = MappingRobot("range-bearing", 0.2, landmarks=3)
     belief = correlated_belief(np.random.default_rng(0), mapping)
     value = np.array([2.0, 0.7])
     variance = torch.from_numpy(NOISE**2)
@@ -75,7 +75,7 @@ def test_a_landmark_enters_with_its_cross_covariance():
 def test_what_no_sighting_shows_is_the_same_tangent_at_all_estimates():
     """Of a world that is shifted and turned as a whole, and of one whose metre is another."""
     generator = np.random.default_rng(4)
-    mapping = MappingRobot(WheeledRobot("cartesian", 0.2), 2, (3.0, -1.0))
+    mapping = MappingRobot("cartesian", 0.2, landmarks=2, origin=(3.0, -1.0))
     point, number = torch.from_numpy(0.3 * generator.normal(size=(20, 16))), torch.ones(20, 1)
     tangent = torch.zeros(16, dtype=torch.float64)
     for part in (slice(0, 2), slice(12, 14), slice(14, 16)):
@@ -97,7 +97,7 @@ def test_a_place_is_seen_where_it_was_seen(kind):
 
 
 def test_a_robot_that_sees_nothing_new_keeps_its_belief():
-    mapping = MappingRobot(WheeledRobot("range-bearing", 0.0), 2)
+    mapping = MappingRobot("range-bearing", 0.0, landmarks=2)
     belief = correlated_belief(np.random.default_rng(2), mapping, (2,))
     value = torch.tensor([[[2.0, 0.5]], [[np.nan, np.nan]]], dtype=torch.float64)
     admitted = mapping.admit(
@@ -125,10 +125,10 @@ def test_robot_and_map_are_as_uncertain_as_they_are_wrong(make):
 def map_while_driving(make, runs, steps, seed):
     """NEES (runs,) of pose and of five landmarks at the end, of robots that are drawn from their own models."""
     duration, generator = 0.5, np.random.default_rng(seed)
-    mapping = MappingRobot(WheeledRobot("range-bearing", 0.1), 5, (2.0, -0.5))
+    mapping = MappingRobot("range-bearing", 0.1, landmarks=5, origin=(2.0, -0.5))
     places = np.array([[0.0, 0.0], [3.0, -1.0], [4.0, 3.0], [0.0, 4.0], [2.0, 1.5]])
     start = torch.tensor([[2.0, -0.5, 0.0]], dtype=torch.float64).expand(runs, 3)
-    alone = mapping.robot.prior(start)
+    alone = mapping.prior(start)
     bayes, belief = make(mapping.space), mapping.enter(alone)
     deviations = np.sqrt(alone.covariance[0].diagonal().numpy())
     pose = BODY.retract(start, torch.from_numpy(deviations[:3] * generator.normal(size=(runs, 3)))).numpy()
@@ -161,7 +161,7 @@ def map_while_driving(make, runs, steps, seed):
 
 def drive_truly(mapping, pose, constants, path, duration, generator):
     """Arcs, of a robot with constants (B, 9) as `wheeled_robot` lists them."""
-    noise = mapping.robot.noise
+    noise = mapping.noise
     distance = path[:, 0] * (1 + constants[:, 0]) + duration * constants[:, 2]
     turn = path[:, 1] * (1 + constants[:, 1]) + duration * constants[:, 3]
     for_drive, for_turn = generator.normal(size=(2, len(pose)))
