@@ -119,7 +119,7 @@ class Association:
         self.count = np.full(len(start), 0 if places is None else len(places))
         self._belief = robot.prior(start)
         self._scale = torch.ones(len(start), 2, dtype=torch.float64)
-        self._platform: WheeledRobot | MappingRobot = robot
+        self._platform = robot
         self._bayes: BayesFilter = make_filter(name, SPACE)
         if places is None:
             mapper = MappingRobot.of_robot(robot, 0, start)

@@ -101,7 +101,7 @@ def localise(
             if tell is not None and k % 100 == 0:
                 tell(k / K)
             belief = robot.move(belief, path[k], duration[k]).belief
-            said = [each[0] for each in robot.nothing(1, B, m)]
+            said = [torch.zeros(B, *shape, dtype=torch.float64) for shape in ((L,), (L,), (L, m), ())]
             if anything[k]:
                 belief, known, *said = robot.look(belief, known, *(each[k] for each in sights))
             if mapper is not None and admitted[k]:

@@ -50,17 +50,14 @@ class MapSpace(Manifold):
 
     @property
     def point_size(self) -> int:
-        """Length of a point."""
+        """Length of a point and of a tangent."""
         return ROBOT_SIZE + 2 * self.landmarks
 
-    @property
-    def tangent_size(self) -> int:
-        """Length of a tangent."""
-        return self.point_size
+    tangent_size = point_size
 
     def _retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         angle = tangent[..., 2:3]
-        places, heading = self._sensed(point)
+        places, heading = self.sensed(point)
         x, y = turn(torch.sin(angle), torch.cos(angle), places)
         a, b = exp_se2(_columns(tangent), angle)
         constants = point[..., 3:ROBOT_SIZE] + tangent[..., 3:ROBOT_SIZE]
@@ -69,13 +66,13 @@ class MapSpace(Manifold):
         return self._at_lever(_joined(places, wrap_angle(heading + angle + constants[..., 5:6]), constants), -1.0)
 
     def _local(self, point: Tensor, other: Tensor) -> Tensor:
-        (places, heading), ((a, b), other_heading) = self._sensed(point), self._sensed(other)
+        (places, heading), ((a, b), other_heading) = self.sensed(point), self.sensed(other)
         angle = wrap_angle(other_heading - heading)
         x, y = turn(torch.sin(angle), torch.cos(angle), places)
         constants = other[..., 3:ROBOT_SIZE] - point[..., 3:ROBOT_SIZE]
         return _joined(log_se2((a - x, b - y), angle), angle, constants)
 
-    def _sensed(self, point: Tensor) -> tuple[Pair, Tensor]:
+    def sensed(self, point: Tensor) -> tuple[Pair, Tensor]:
         """Places (..., 1 + M) of sensor and landmarks from the origin, in the sensor's metre; its heading (..., 1)."""
         scale, (x, y) = 1.0 + point[..., 9:10], _columns(self._at_lever(point, 1.0))
         return (scale * (x - self.origin[0]), scale * (y - self.origin[1])), point[..., 2:3] - point[..., 8:9]
@@ -171,6 +168,15 @@ class MappingRobot(WheeledRobot):
             number = torch.where(there, landmark[..., slot], -1)[..., None]
             belief = bayes.predict(belief, MotionModel(self._put, noise, additive=False), seen, number).belief
         return belief
+
+    def place(self, state: Tensor, value: Tensor) -> Tensor:
+        """Where in the world (..., 2) a landmark is of which that was seen, the inverse of (9.45)."""
+        ahead, left = value[..., :1], value[..., 1:]
+        if self.kind == "range-bearing":
+            ahead, left = ahead * torch.cos(left), ahead * torch.sin(left)
+        (x, y), heading = replace(self.space, landmarks=0).sensed(state[..., :ROBOT_SIZE])
+        ahead, left = turn(torch.sin(heading), torch.cos(heading), (ahead, left))
+        return torch.cat([x + ahead, y + left], dim=-1) / (1.0 + state[..., 9:10]) + state.new_tensor(self.origin)
 
     def _put(self, state: Tensor, noise: Tensor, value: Tensor, landmark: Tensor) -> Tensor:
         """The state with the landmark of that number (..., 1) where a sighting says; unchanged for -1."""

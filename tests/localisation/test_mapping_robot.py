@@ -90,10 +90,12 @@ def test_what_no_sighting_shows_is_the_same_tangent_at_all_estimates():
 @pytest.mark.parametrize("kind", ["range-bearing", "cartesian"])
 def test_a_place_is_seen_where_it_was_seen(kind):
     generator = np.random.default_rng(1)
-    robot = WheeledRobot(kind, 0.2)
+    robot = MappingRobot(kind, 0.2, origin=(1.0, -2.0))
     state = torch.from_numpy(0.3 * generator.normal(size=(20, ROBOT_SIZE)))
     value = torch.from_numpy(np.column_stack([generator.uniform(1, 4, 20), generator.uniform(-1.5, 1.5, 20)]))
-    np.testing.assert_allclose(robot.measurement().function(state, robot.place(state, value)), value, atol=1e-12)
+    np.testing.assert_allclose(
+        WheeledRobot(kind, 0.2).measurement().function(state, robot.place(state, value)), value, atol=1e-12
+    )
 
 
 def test_a_robot_that_sees_nothing_new_keeps_its_belief():

@@ -58,7 +58,8 @@ def is_flat(space: Space | None) -> bool:
 class Manifold(ABC):
     """A space with a tangent space at each point, whose arguments' sizes are checked.
 
-    Subclasses implement `_retract` and `_local`, which may rely on the sizes of their arguments.
+    Subclasses implement `_retract` and `_local`, which may rely on the sizes of their arguments. With an attribute
+    `parallel` that is true a filter carries covariances from one point to another as they are, as invariant ones do.
     """
 
     @property
@@ -74,11 +75,6 @@ class Manifold(ABC):
     @property
     def flat(self) -> bool:
         """Whether retract is addition and local is subtraction."""
-        return False
-
-    @property
-    def parallel(self) -> bool:
-        """Whether a filter carries a covariance from one point to another as it is, as invariant filters do."""
         return False
 
     def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
