@@ -148,9 +148,8 @@ class Association:
             number, used = np.maximum(self.found[k], 0), (self.found[k] != NOBODY) & ~new
             seconds, rows = steps.seconds[k + 1], np.arange(len(present))[:, None]
             since = torch.from_numpy(np.where(used, seconds[:, None] - last[rows, number], np.inf))
-            last[np.broadcast_to(rows, used.shape)[used | new], number[used | new]] = np.repeat(
-                seconds, (used | new).sum(axis=1)
-            )
+            b, slot = np.nonzero(used | new)
+            last[b, number[b, slot]] = seconds[b]
             number = torch.from_numpy(number)
             seen = torch.where(torch.from_numpy(used)[..., None], value[k], torch.nan)
             position = number[..., None] if self._places is None else self._places[number]

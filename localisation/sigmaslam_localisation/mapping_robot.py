@@ -131,10 +131,11 @@ class MappingRobot(WheeledRobot):
     def grow(self, belief: Gaussian) -> Gaussian:
         """A belief of fewer landmarks; those beyond them stand at the origin, independent of all."""
         before = belief.covariance
-        more = self.space.point_size - before.shape[-1]
+        more = (self.space.point_size - before.shape[-1]) // 2
         covariance = torch.eye(self.space.point_size, dtype=before.dtype).repeat(*before.shape[:-2], 1, 1)
         covariance[..., : before.shape[-1], : before.shape[-1]] = before
-        return Gaussian(torch.nn.functional.pad(belief.mean, (0, more)), covariance)
+        places = belief.mean.new_tensor(self.origin).repeat(*before.shape[:-2], more)
+        return Gaussian(torch.cat([belief.mean, places], dim=-1), covariance)
 
     def measurement(self) -> MeasurementModel:
         """Sighting of the landmark whose number is the input (..., 1), of unit noise."""
