@@ -80,10 +80,11 @@ class Linearisation:
     def carry(self, point: Tensor, shift: Tensor | None, root: Tensor, target: Tensor) -> list[Tensor]:
         """Deviations (..., n, c), in the chart at `target`, of a belief in the chart at `point` with mean `shift`.
 
-        In R^n they are the root itself. With a shift, the target is point [+] shift.
+        In R^n, and where a space carries tangents as they are, they are the root itself. With a shift, the target is
+        point [+] shift.
         """
         chart = self.chart
-        if chart is None or self.space is None:
+        if chart is None or self.space is None or getattr(self.space, "parallel", False):
             return [root]
         if isinstance(self.transform, Taylor):
             maps, directions = tangent_maps(self.space), root.movedim(-1, 0)

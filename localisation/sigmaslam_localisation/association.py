@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2, mode
 from torch import Tensor
 
-from sigmaslam_filters import BayesFilter, Diagonal, Gaussian, several
+from sigmaslam_filters import BayesFilter, Diagonal, several
 from sigmaslam_localisation.localise import FilterName, make_filter
 from sigmaslam_localisation.mapping_robot import MappingRobot
 from sigmaslam_localisation.recording import Recording
@@ -119,10 +119,15 @@ class Association:
         self.count = np.full(len(start), 0 if places is None else len(places))
         self._belief = robot.prior(start)
         self._scale = torch.ones(len(start), 2, dtype=torch.float64)
-        self._platform: WheeledRobot | MappingRobot = robot
+        self._platform = robot
         self._bayes: BayesFilter = make_filter(name, SPACE)
         if places is None:
-            self._grow(0)
+            mapper = MappingRobot.of_robot(robot, 0, start)
+            self._platform, self._bayes, self._belief = (
+                mapper,
+                make_filter(name, mapper.space),
+                mapper.enter(self._belief),
+            )
 
     def run(self, tell: Callable[[float], None]) -> None:
         """Goes through all steps."""
@@ -143,9 +148,8 @@ class Association:
             number, used = np.maximum(self.found[k], 0), (self.found[k] != NOBODY) & ~new
             seconds, rows = steps.seconds[k + 1], np.arange(len(present))[:, None]
             since = torch.from_numpy(np.where(used, seconds[:, None] - last[rows, number], np.inf))
-            last[np.broadcast_to(rows, used.shape)[used | new], number[used | new]] = np.repeat(
-                seconds, (used | new).sum(axis=1)
-            )
+            b, slot = np.nonzero(used | new)
+            last[b, number[b, slot]] = seconds[b]
             number = torch.from_numpy(number)
             seen = torch.where(torch.from_numpy(used)[..., None], value[k], torch.nan)
             position = number[..., None] if self._places is None else self._places[number]
@@ -172,8 +176,10 @@ class Association:
                 new[b, rows[away]] = True
                 found[b, rows[away]] = count + np.arange(away.sum())
                 self.count[b] += away.sum()
-        if self._places is None:
-            self._grow(int(self.count.max()))
+        if isinstance(self._platform, MappingRobot) and self.count.max() > self._platform.landmarks:
+            self._platform = replace(self._platform, landmarks=int(self.count.max()))
+            self._bayes = replace(self._bayes, space=self._platform.space)
+            self._belief = self._platform.grow(self._belief)
         return new
 
     def _expect(self) -> tuple[np.ndarray, np.ndarray]:
@@ -194,18 +200,6 @@ class Association:
             return value - expected
         difference: np.ndarray = residual(torch.from_numpy(value), torch.from_numpy(expected)).numpy()
         return difference
-
-    def _grow(self, landmarks: int) -> None:
-        """A map of so many landmarks; those beyond what is known stand at the origin, independent of all."""
-        if isinstance(self._platform, MappingRobot) and self._platform.landmarks == landmarks:
-            return
-        self._platform = MappingRobot(self._robot, landmarks)
-        self._bayes = make_filter(self._name, self._platform.space)
-        before, size = self._belief, self._platform.space.tangent_size
-        more = size - before.covariance.shape[-1]
-        covariance = torch.eye(size, dtype=torch.float64).repeat(*before.mean.shape[:-1], 1, 1)
-        covariance[..., : size - more, : size - more] = before.covariance
-        self._belief = Gaussian(torch.nn.functional.pad(before.mean, (0, more)), covariance)
 
 
 def associate(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,13 +11,12 @@ import numpy as np
 import torch
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text
 from sigmaslam.plot_style import BLUE, GREY, has_matplotlib
 from sigmaslam.report.figures import save_png
 from sigmaslam_filters import SO3, Gaussian, degree_of_belief
-from sigmaslam_localisation.localisation_page import draw_axes, write_page
+from sigmaslam_localisation.localisation_page import draw_axes
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
-from sigmaslam_localisation.output import write_lines
+from sigmaslam_localisation.output import write_run
 from sigmaslam_localisation.starry import StereoRecording
 from sigmaslam_localisation.steps import DELAYS, Steps
 from sigmaslam_localisation.stereo_points import BODY, CONSTANTS, SPACE, StereoBody
@@ -27,15 +25,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-ERRORS = ("position_rmse", "rotation_rmse", "nees_median", "nees_mean")
-"""Scores that need a truth."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyEstimate:
     """Where a body was.
 
     Attributes:
+        name: of the recording.
         seconds: (K + 1,).
         pose: (K + 1, 7) translation in metres and quaternion x, y, z, w of the body in the world.
         covariance: (K + 1, 6, 6) of twists in the body's frame, translation before rotation.
@@ -49,6 +44,7 @@ class BodyEstimate:
         smoothed, lagged: the same given what was seen later: all of it, or with a fixed lag; None if not asked for.
     """
 
+    name: str
     seconds: np.ndarray
     pose: np.ndarray
     covariance: np.ndarray
@@ -120,6 +116,7 @@ def _estimate(
     """Of the member of the batch with that index."""
     nis, nothing = result.nis[:, index], np.empty(0)
     estimate = BodyEstimate(
+        recording.name,
         steps.seconds[:, index],
         nothing,
         nothing,
@@ -163,38 +160,20 @@ def score_body(estimate: BodyEstimate) -> dict[str, float]:
 def write_body(
     folder: Path, recording: StereoRecording, first: BodyEstimate, estimate: BodyEstimate, settings: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Write trajectory.csv, trajectory_first_pass.csv, run.json, map.png and report.html into a folder that is there.
-
-    Returns:
-        The summary by name, as in run.json.
-    """
-    write_lines(folder / "trajectory.csv", _lines(recording.name, estimate))
-    write_lines(folder / "trajectory_first_pass.csv", _lines(recording.name, first))
-    later = {}
-    for kind in ("smoothed", "lagged"):
-        if (found := getattr(estimate, kind)) is not None:
-            write_lines(folder / f"trajectory_{kind}.csv", _lines(recording.name, found))
-            later[kind] = {recording.name: score_body(found)}
-    summaries, at_first = ({recording.name: score_body(each)} for each in (estimate, first))
-    atomic_write_text(
-        folder / "run.json",
-        json.dumps({**settings, "robots": summaries, "first_pass": at_first, **later}, indent=2) + "\n",
-    )
-    write_page(folder / "report.html", recording.name, summaries, _draw(recording, estimate, folder / "map.png"))
-    for kind, scores in later.items():
-        errors = {label: value for label, value in scores[recording.name].items() if label in ERRORS}
-        summaries[recording.name] |= {f"{kind}_{label}": value for label, value in errors.items()}
-    return summaries
+    """Write all files of a body into a folder that is there; returns as `write_run`."""
+    figures = _draw(recording, estimate, folder / "map.png")
+    return write_run(folder, recording.name, settings, [first], [estimate], _trajectory, score_body, figures)
 
 
-def _lines(name: str, estimate: BodyEstimate) -> Iterable[str]:
+def _trajectory(estimates: Sequence[BodyEstimate]) -> Iterable[str]:
     """Poses, the upper triangle of the covariance row by row, belief and count of points."""
     rows, columns = np.triu_indices(6)
     cells = ",".join(f"cov_{row}{column}" for row, column in zip(rows, columns, strict=True))
     yield f"robot,time,x,y,z,qx,qy,qz,qw,{cells},belief,sightings"
-    table = np.column_stack([estimate.pose, estimate.covariance[:, rows, columns], estimate.belief])
-    for second, numbers, seen in zip(estimate.seconds, table, estimate.seen, strict=True):
-        yield f"{name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
+    for estimate in estimates:
+        table = np.column_stack([estimate.pose, estimate.covariance[:, rows, columns], estimate.belief])
+        for second, numbers, seen in zip(estimate.seconds, table, estimate.seen, strict=True):
+            yield f"{estimate.name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
 
 
 def _draw(recording: StereoRecording, estimate: BodyEstimate, png: Path) -> list[tuple[str, str, Figure]]:

@@ -56,7 +56,9 @@ def run_compiled(
     if K < SHORTEST or WIDTHS[-1] < L:
         return None
     fills = torch.nan, 0.0, 1.0, 1.0
-    sights = [_padded(each, WIDTHS[-1], fill) for each, fill in zip(sights, fills, strict=True)]
+    more = [0, WIDTHS[-1] - L]
+    pairs = zip(sights, fills, strict=True)
+    sights = [torch.nn.functional.pad(each, [0, 0] * (each.ndim - 3) + more, value=fill) for each, fill in pairs]
     from torch._inductor.exc import CppCompileError, InvalidCxxCompiler
 
     from sigmaslam_filters.compiler.scalar_sequence import CompiledStep, Plan, load_driver, run_sequence
@@ -94,12 +96,6 @@ def run_compiled(
         return None
     mean, said = both[..., :p], [each[:, :, :L] for each in said]
     return Gaussian(mean[-1], covariance[-1]), (mean, covariance, both[..., p:], *said, log_likelihood)
-
-
-def _padded(array: Tensor, slots: int, fill: float) -> Tensor:
-    """(K, B, L, ...) with more slots."""
-    more = array.new_full((*array.shape[:2], slots - array.shape[2], *array.shape[3:]), fill)
-    return torch.cat([array, more], dim=2)
 
 
 def _source(robot: RobotStep, points: int, arguments: list[Tensor]) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from sigmaslam_filters import BayesFilter, ExtendedKalmanFilter, Gaussian, UnscentedKalmanFilter
 from sigmaslam_filters.manifolds import Space
 from sigmaslam_localisation.compiled_robot import run_compiled
+from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot
 from sigmaslam_localisation.robot_step import Platform, RobotStep
 from sigmaslam_localisation.sighting_noise import STUDENT_DOF, repetition
 from sigmaslam_localisation.smoothing import Smoother
@@ -26,22 +27,12 @@ def make_filter(name: FilterName, space: Space) -> BayesFilter:
     return UnscentedKalmanFilter(space, iterations=3 if name == "iterated" else "auto")
 
 
-class Admission(Protocol):
-    """Takes landmarks into the state at their first sighting; see `MappingRobot.admit`."""
-
-    def __call__(
-        self, bayes: BayesFilter, belief: Gaussian, value: Tensor, variance: Tensor, landmark: Tensor, new: Tensor
-    ) -> Gaussian:
-        """The belief with the new landmarks."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Localisation:
     """What a filter says of each step; time first, then robots.
 
     Attributes:
-        mean: (K + 1, B, p) points of the state's space, or what was to be kept of them; the first is the start.
+        mean: (K + 1, B, p) points of the state's space, without the landmarks; the first is the start.
         covariance: (K + 1, B, n, n) of the tangent, likewise.
         nis: (K, B, L) squared normalised innovation of each sighting; NaN for none.
         weight: (K, B, L) that robust weights leave of a sighting.
@@ -71,23 +62,18 @@ def localise(
     steps: Steps,
     scale: Tensor | None = None,
     tell: Callable[[float], None] | None = None,
-    admit: Admission | None = None,
-    kept: int | None = None,
     smoothing: bool = False,
 ) -> Localisation:
     """Filter all robots at once.
 
     Args:
         bayes: the filter.
-        platform: models of the robots.
+        platform: models of the robots. The first sightings of a `MappingRobot` go into its map and update nothing.
         prior: (B,) beliefs at the start.
         steps: (K, B) motions and sightings.
         scale: (B, m) variance of the noise at the start, over the nominal one; None: 1.
         tell: called with the share that is done.
-        admit: for a map that is not known: first sightings go to it and update nothing, and the measurement's input is
-            the number of the landmark (..., 1) instead of its place.
-        kept: components of the state whose history is returned, in points and tangents; None: all.
-        smoothing: keep what smoothers need; not with `kept`.
+        smoothing: keep what smoothers need; not with a `MappingRobot`.
     """
     K, B, L, m = steps.value.shape
     path, duration, value, position = (
@@ -95,7 +81,9 @@ def localise(
     )
     present = ~value.isnan().any(dim=-1)
     landmark, new = torch.from_numpy(steps.landmark), torch.zeros_like(present)
-    if admit is not None:
+    mapper = platform if isinstance(platform, MappingRobot) else None
+    kept = None if mapper is None else ROBOT_SIZE
+    if mapper is not None:
         new = present & torch.from_numpy(steps.since).isinf()
         present, position = present & ~new, landmark[..., None]
     seen = torch.where(present[..., None], value, torch.nan)
@@ -104,7 +92,7 @@ def localise(
     robot = RobotStep(bayes, platform, L)
     start = torch.ones(B, m, dtype=torch.float64) if scale is None else scale
     moves, sights = (path, duration), (seen, position, growth, nominal)
-    found = None if admit is not None else run_compiled(robot, prior, start, moves, sights, tell)
+    found = None if mapper is not None else run_compiled(robot, prior, start, moves, sights, tell)
     if found is None:
         belief, known = prior, start
         admitted, anything = (each.any(dim=-1).any(dim=-1).tolist() for each in (new, present))
@@ -113,13 +101,13 @@ def localise(
             if tell is not None and k % 100 == 0:
                 tell(k / K)
             belief = robot.move(belief, path[k], duration[k]).belief
-            said = [each[0] for each in robot.nothing(1, B, m)]
+            said = [torch.zeros(B, *shape, dtype=torch.float64) for shape in ((L,), (L,), (L, m), ())]
             if anything[k]:
                 belief, known, *said = robot.look(belief, known, *(each[k] for each in sights))
-            if admit is not None and admitted[k]:
+            if mapper is not None and admitted[k]:
                 # The variance of Student's t: a first sighting may be an outlier, and nothing tells.
                 spread = nominal[k] * known[:, None] * (STUDENT_DOF / (STUDENT_DOF - 2.0))
-                belief = admit(bayes, belief, value[k], spread, landmark[k], new[k])
+                belief = mapper.admit(bayes, belief, value[k], spread, landmark[k], new[k])
             rows.append((belief.mean[:, :kept], belief.covariance[:, :kept, :kept], known, *said))
         found = belief, tuple(torch.stack(column) for column in zip(*rows, strict=True))
     final, (means, covariances, scales, nis, weight, innovation, log_likelihood) = found

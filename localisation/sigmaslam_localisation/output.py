@@ -1,9 +1,9 @@
 """Files that a localisation leaves: trajectories, innovations, a summary, a map and a report."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,48 @@ from sigmaslam_localisation.recording import Recording
 from sigmaslam_localisation.robots import RobotEstimate
 from sigmaslam_localisation.scores import innovation_statistics, score, score_map
 
-TRAJECTORY_COLUMNS = "robot,time,x,y,heading,cov_xx,cov_xy,cov_xh,cov_yy,cov_yh,cov_hh,belief,sightings"
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sigmaslam_localisation.body import BodyEstimate
+
+ERRORS = ("position_rmse", "heading_rmse", "rotation_rmse", "nees_median", "nees_mean")
+"""Scores that need a truth."""
+Estimate = TypeVar("Estimate", RobotEstimate, "BodyEstimate")
+
+
+def write_run(
+    folder: Path,
+    name: str,
+    settings: Mapping[str, Any],
+    first: Sequence[Estimate],
+    second: Sequence[Estimate],
+    trajectory: Callable[[Sequence[Estimate]], Iterable[str]],
+    score: Callable[[Estimate], dict[str, Any]],
+    figures: Sequence[tuple[str, str, "Figure"]],
+) -> dict[str, dict[str, Any]]:
+    """Write the trajectories of two passes and of smoothers, run.json and report.html into a folder that is there.
+
+    Returns:
+        The summary of the second pass by name, as in run.json, with the errors of the smoothers.
+    """
+    write_lines(folder / "trajectory.csv", trajectory(second))
+    write_lines(folder / "trajectory_first_pass.csv", trajectory(first))
+    summaries, at_first = ({each.name: score(each) for each in estimates} for estimates in (second, first))
+    later: dict[str, dict[str, dict[str, Any]]] = {}
+    for kind in ("smoothed", "lagged"):
+        estimates = [found for each in second if (found := getattr(each, kind)) is not None]
+        if estimates:
+            write_lines(folder / f"trajectory_{kind}.csv", trajectory(estimates))
+            scores = {each.name: score(each) for each in estimates}
+            later[kind] = {each: {k: found[k] for k in ERRORS if k in found} for each, found in scores.items()}
+    run = {**settings, "robots": summaries, "first_pass": at_first, **later}
+    atomic_write_text(folder / "run.json", json.dumps(run, indent=2) + "\n")
+    for kind, errors in later.items():
+        for each, found in errors.items():
+            summaries[each] |= {f"{kind}_{label}": value for label, value in found.items()}
+    write_page(folder / "report.html", name, summaries, figures)
+    return summaries
 
 
 def write_robots(
@@ -24,34 +65,12 @@ def write_robots(
     recordings: Sequence[Recording],
     settings: Mapping[str, Any],
 ) -> dict[str, dict[str, Any]]:
-    """Write all files into a folder that is there.
-
-    Returns:
-        The summary of the second pass by robot, as in run.json, with the errors of the smoothers.
-    """
-    names = max((each.landmark_names for each in recordings), key=len)
-    write_trajectories(folder / "trajectory.csv", second)
-    write_trajectories(folder / "trajectory_first_pass.csv", first)
+    """Write all files of robots into a folder that is there; returns as `write_run`."""
     _write_innovations(folder / "innovations.csv", second)
-    later = {}
-    for kind in ("smoothed", "lagged"):
-        estimates = [found for each in second if (found := getattr(each, kind)) is not None]
-        if estimates:
-            write_trajectories(folder / f"trajectory_{kind}.csv", estimates)
-            later[kind] = {each.name: score(each) for each in estimates}
     if any(estimate.map is not None for estimate in second):
-        _write_maps(folder / "landmarks.csv", second, names)
-    summaries = {estimate.name: summarise(estimate) for estimate in second}
-    at_first = {estimate.name: summarise(estimate) for estimate in first}
-    run = {**settings, "robots": summaries, "first_pass": at_first, **later}
-    atomic_write_text(folder / "run.json", json.dumps(run, indent=2) + "\n")
-    write_page(
-        folder / "report.html", name, summaries, draw_robots(second, recordings[0].landmarks, folder / "map.png")
-    )
-    for kind, scores in later.items():
-        for robot, errors in scores.items():
-            summaries[robot] |= {f"{kind}_{label}": value for label, value in errors.items()}
-    return summaries
+        _write_maps(folder / "landmarks.csv", second, max((each.landmark_names for each in recordings), key=len))
+    figures = draw_robots(second, recordings[0].landmarks, folder / "map.png")
+    return write_run(folder, name, settings, first, second, _trajectory, summarise, figures)
 
 
 def summarise(estimate: RobotEstimate) -> dict[str, Any]:
@@ -73,22 +92,16 @@ def summarise(estimate: RobotEstimate) -> dict[str, Any]:
     }
 
 
-def write_trajectories(path: Path, estimates: Sequence[RobotEstimate]) -> None:
+def _trajectory(estimates: Sequence[RobotEstimate]) -> Iterable[str]:
     """Poses in metres and radians, the covariance of x, y and heading in the world, and the belief in the position."""
     rows, columns = np.triu_indices(3)
-
-    def lines() -> Iterable[str]:
-        yield TRAJECTORY_COLUMNS
-        for estimate in estimates:
-            heading = np.arctan2(np.sin(estimate.pose[:, 2]), np.cos(estimate.pose[:, 2]))
-            table = np.column_stack(
-                [estimate.pose[:, :2], heading, estimate.covariance[:, rows, columns], estimate.belief]
-            )
-            count = (estimate.seen >= 0).sum(axis=1)
-            for second, numbers, seen in zip(estimate.seconds, table, count, strict=True):
-                yield f"{estimate.name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
-
-    write_lines(path, lines())
+    yield "robot,time,x,y,heading,cov_xx,cov_xy,cov_xh,cov_yy,cov_yh,cov_hh,belief,sightings"
+    for estimate in estimates:
+        heading = np.arctan2(np.sin(estimate.pose[:, 2]), np.cos(estimate.pose[:, 2]))
+        table = np.column_stack([estimate.pose[:, :2], heading, estimate.covariance[:, rows, columns], estimate.belief])
+        count = (estimate.seen >= 0).sum(axis=1)
+        for second, numbers, seen in zip(estimate.seconds, table, count, strict=True):
+            yield f"{estimate.name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
 
 
 def _write_innovations(path: Path, estimates: Sequence[RobotEstimate]) -> None:

@@ -11,8 +11,10 @@ from torch import Tensor
 
 from sigmaslam.errors import InputError
 from sigmaslam_filters import Gaussian, degree_of_belief
+from sigmaslam_filters.manifolds import Space
+from sigmaslam_filters.manifolds.tangent_maps import tangent_maps
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter
-from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot
+from sigmaslam_localisation.mapping_robot import ROBOT_SIZE, MappingRobot, MapSpace
 from sigmaslam_localisation.recording import PlanarTruth, Recording
 from sigmaslam_localisation.robot_step import Platform
 from sigmaslam_localisation.smoothing import Smoother
@@ -102,38 +104,32 @@ def localise_robots(
     Raises:
         InputError: there is no pose to start from.
     """
-    robot = WheeledRobot.of(recordings[0])
-    mapper = MappingRobot(robot, max(len(each.landmarks) for each in recordings)) if mapping else None
-    platform: Platform = robot if mapper is None else mapper
-    admit = None if mapper is None else mapper.admit
-    bayes = make_filter(filter_name, SPACE if mapper is None else mapper.space)
     count = len(DELAYS)
     steps = make_steps([each for each in recordings for _ in DELAYS], [*DELAYS] * len(recordings))
-    prior = (robot if mapper is None else mapper).prior(first_poses(recordings, steps.seconds[0, ::count], start))
+    starts = first_poses(recordings, steps.seconds[0, ::count], start)
+    robot = WheeledRobot.of(recordings[0])
+    prior = robot.prior(starts)
     repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
-    first = localise(
-        bayes, platform, repeated, steps, None, lambda done: tell(f"first pass: {done:.0%}"), admit, ROBOT_SIZE
-    )
+    platform: Platform = robot
+    space: Space = SPACE
+    if mapping:
+        mapper = MappingRobot.of_robot(robot, max(len(each.landmarks) for each in recordings), starts)
+        platform, space, repeated = mapper, mapper.space, mapper.enter(repeated)
+    bayes = make_filter(filter_name, space)
+    first = localise(bayes, platform, repeated, steps, tell=lambda done: tell(f"first pass: {done:.0%}"))
     best = first.log_likelihood.reshape(-1, count).argmax(axis=1)
     chosen = np.arange(len(recordings)) * count + best
     delays = [DELAYS[index] for index in best]
-    at_first = _estimates(recordings, delays, steps, first, chosen)
+    at_first = _estimates(recordings, delays, steps, first, chosen, space)
 
     steps = make_steps(recordings, delays)
     prior = _with_constants(prior, _pick(first.final, torch.from_numpy(chosen)))
+    prior = mapper.enter(prior) if mapping else prior
     scale = torch.from_numpy(first.scale[-1, chosen])
     second = localise(
-        bayes,
-        platform,
-        prior,
-        steps,
-        scale,
-        lambda done: tell(f"second pass: {done:.0%}"),
-        admit,
-        ROBOT_SIZE,
-        lag is not None,
+        bayes, platform, prior, steps, scale, lambda done: tell(f"second pass: {done:.0%}"), lag is not None
     )
-    estimates = _estimates(recordings, delays, steps, second, np.arange(len(recordings)))
+    estimates = _estimates(recordings, delays, steps, second, np.arange(len(recordings)), space)
     if lag is None:
         return at_first, estimates
     tell("smoothing")
@@ -149,7 +145,7 @@ def _with_smoothed(estimate: RobotEstimate, smoother: Smoother, lag: float) -> R
     found = []
     for mean, covariance in (smoother.smooth(), smoother.smooth(seconds, lag)):
         pose = mean[:count, :3]
-        spread = _in_world(pose, covariance[:count, :3, :3])
+        spread = in_world(SPACE, mean[:count], covariance[:count])[:, :3, :3]
         belief = degree_of_belief(torch.from_numpy(spread[:, :2, :2])).numpy()
         found.append(replace(estimate, pose=pose, covariance=spread, belief=belief))
     return replace(estimate, smoothed=found[0], lagged=found[1])
@@ -190,13 +186,19 @@ def _with_constants(prior: Gaussian, known: Gaussian) -> Gaussian:
 
 
 def _estimates(
-    recordings: Sequence[Recording], delays: Sequence[float], steps: Steps, result: Localisation, chosen: np.ndarray
+    recordings: Sequence[Recording],
+    delays: Sequence[float],
+    steps: Steps,
+    result: Localisation,
+    chosen: np.ndarray,
+    space: Space,
 ) -> list[RobotEstimate]:
     estimates = []
+    alone = replace(space, landmarks=0) if isinstance(space, MapSpace) else space
     for recording, delay, b in zip(recordings, delays, chosen, strict=True):
         K = int(steps.count[b])
         pose = result.mean[: K + 1, b, :3]
-        covariance = _in_world(pose, result.covariance[: K + 1, b, :3, :3])
+        covariance = in_world(alone, result.mean[: K + 1, b], result.covariance[: K + 1, b])[:, :3, :3]
         belief = degree_of_belief(torch.from_numpy(covariance[:, :2, :2])).numpy()
         final, deviation = result.mean[K, b], np.sqrt(np.diagonal(result.covariance[K, b]))
         nis = result.nis[:K, b]
@@ -220,25 +222,29 @@ def _estimates(
                 {name: (float(final[i]), float(deviation[i])) for i, name in enumerate(CONSTANTS, start=3)},
                 np.sqrt(result.scale[K - 1, b]),
                 recording.truth,
-                _map(recording, result.final[int(b)], steps.landmark[:K, b][~np.isnan(steps.value[:K, b, :, 0])]),
+                _map(
+                    recording, result.final[int(b)], steps.landmark[:K, b][~np.isnan(steps.value[:K, b, :, 0])], space
+                ),
             )
         )
     return estimates
 
 
-def _map(recording: Recording, final: Gaussian, seen: np.ndarray) -> LandmarkMap | None:
+def _map(recording: Recording, final: Gaussian, seen: np.ndarray, space: Space) -> LandmarkMap | None:
     """What the belief at the end says of the landmarks that were seen; None if they are no part of the state."""
-    if final.mean.shape[-1] == ROBOT_SIZE:
+    if not isinstance(space, MapSpace):
         return None
     landmark = np.unique(seen)
     rows = (ROBOT_SIZE + 2 * landmark[:, None] + [0, 1]).ravel()
-    covariance = final.covariance.numpy()[np.ix_(rows, rows)]
-    return LandmarkMap(landmark, final.mean.numpy()[rows].reshape(-1, 2), covariance, recording.landmarks[landmark])
+    mean = final.mean.numpy()
+    covariance = in_world(space, mean, final.covariance.numpy())[np.ix_(rows, rows)]
+    return LandmarkMap(landmark, mean[rows].reshape(-1, 2), covariance, recording.landmarks[landmark])
 
 
-def _in_world(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Covariances (K, 3, 3) of x, y, heading from those of twists in the robot's frame."""
-    sine, cosine, zero, one = np.sin(pose[:, 2]), np.cos(pose[:, 2]), np.zeros(len(pose)), np.ones(len(pose))
-    turn = np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
-    turned: np.ndarray = turn @ covariance @ turn.transpose(0, 2, 1)
-    return turned
+def in_world(space: Space, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Covariances (..., p, p) of points (..., p) from those of tangents (..., n, n)."""
+    point = torch.from_numpy(mean)
+    along = torch.eye(covariance.shape[-1], dtype=point.dtype).expand(*mean.shape[:-1], -1, -1)
+    change = tangent_maps(space).push_retract(point[..., None, :], along).mT.numpy()
+    moved: np.ndarray = change @ covariance @ np.swapaxes(change, -1, -2)
+    return moved

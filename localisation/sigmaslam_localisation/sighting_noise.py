@@ -1,9 +1,5 @@
 """Noise of repeated sightings, and how a filter learns its size from the innovations."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
-
 import torch
 from torch import Tensor
 
@@ -29,30 +25,21 @@ def repetition(since: Tensor, correlation: float = CORRELATION_SECONDS) -> Tenso
     return (1.0 + rho) / (1.0 - rho)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NoiseScale:
-    """Variances of a sensor, in units of those it was said to have.
+def learned_scale(
+    scale: Tensor, innovation: Tensor, predicted: Tensor, nominal: Tensor, share: Tensor, present: Tensor
+) -> Tensor:
+    """Variances (..., m) in units of those a sensor was said to have: what innovations have beyond the belief's part.
 
-    Attributes:
-        scale: (..., m) of each component.
+    Args:
+        scale: (..., m) before these sightings.
+        innovation: (..., L, m).
+        predicted: (..., L, m) variance of the belief's part of it.
+        nominal: (..., L, m) variance of the noise that was expected.
+        share: (..., L) how much of a new sighting each one is; less than 1 for repetitions and outliers.
+        present: (..., L) whether there is one.
     """
-
-    scale: Tensor
-
-    def learn(
-        self, innovation: Tensor, predicted: Tensor, nominal: Tensor, share: Tensor, present: Tensor
-    ) -> NoiseScale:
-        """The scale after some sightings: what innovations have beyond the belief's part is the noise's.
-
-        Args:
-            innovation: (..., L, m).
-            predicted: (..., L, m) variance of the belief's part of it.
-            nominal: (..., L, m) variance of the noise that was expected.
-            share: (..., L) how much of a new sighting each one is; less than 1 for repetitions and outliers.
-            present: (..., L) whether there is one.
-        """
-        total = predicted + nominal
-        surplus = (innovation.square() / total - 1.0) * nominal / total
-        surplus = torch.where(present[..., None], surplus * share[..., None], 0.0).sum(dim=-2)
-        # As an exponent it stays positive; bounded, so that one step with many sightings does not decide all.
-        return replace(self, scale=self.scale * torch.exp((LEARNING_RATE * surplus).clamp(-0.5, 0.5)))
+    total = predicted + nominal
+    surplus = (innovation.square() / total - 1.0) * nominal / total
+    surplus = torch.where(present[..., None], surplus * share[..., None], 0.0).sum(dim=-2)
+    # As an exponent it stays positive; bounded, so that one step with many sightings does not decide all.
+    return scale * torch.exp((LEARNING_RATE * surplus).clamp(-0.5, 0.5))

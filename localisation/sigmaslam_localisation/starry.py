@@ -9,7 +9,7 @@ import torch
 
 from sigmaslam.errors import InputError
 from sigmaslam_filters import SO3
-from sigmaslam_localisation.steps import Steps, since_before, slots
+from sigmaslam_localisation.steps import Steps, in_slots
 from sigmaslam_localisation.stereo_points import StereoNoise, StereoRig
 from sigmaslam_localisation.tubes import read_mat
 
@@ -46,11 +46,8 @@ class StereoRecording:
         """
         path = np.stack([self._path(delay) for delay in delays], axis=1)
         step, landmark = np.nonzero(self.pixels[1:, :, 0] >= 0)
-        slot = slots(step)
-        shape = (len(path), int(slot.max(initial=0)) + 1)
-        value, index, since = np.full((*shape, 4), np.nan), np.zeros(shape, int), np.full(shape, np.inf)
-        value[step, slot], index[step, slot] = self.pixels[1:][step, landmark], landmark
-        since[step, slot] = since_before(self.seconds[1:][step], landmark)
+        pixels = self.pixels[1:][step, landmark]
+        value, index, since = in_slots(len(path), step, self.seconds[1:][step], landmark, pixels)
         count = len(delays)
         seconds, durations, values, indices, positions, times = (
             np.repeat(column[:, None], count, axis=1)

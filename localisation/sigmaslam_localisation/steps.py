@@ -92,12 +92,7 @@ def _steps(recording: Recording, delay: float) -> Steps:
         seconds = np.insert(seconds, 0, start)
     path = _integrated(recording, delay - late, seconds)
     step = np.maximum(np.searchsorted(seconds, times, side="right") - 2, 0)
-    slot = slots(step)
-    shape = (len(seconds) - 1, int(slot.max(initial=0)) + 1)
-    value = np.full((*shape, sightings.shape[1]), np.nan)
-    index = np.zeros(shape, int)
-    since = np.full(shape, np.inf)
-    value[step, slot], index[step, slot], since[step, slot] = sightings, landmark, since_before(times, landmark)
+    value, index, since = in_slots(len(path), step, times, landmark, sightings)
     return Steps(
         np.array([len(path)]),
         seconds[:, None],
@@ -131,10 +126,15 @@ def _integrated(recording: Recording, delay: float, seconds: np.ndarray) -> np.n
     return np.diff(np.stack([np.interp(seconds, edges, column) for column in total.T], axis=1), axis=0)
 
 
-def slots(step: np.ndarray) -> np.ndarray:
-    """Place (S,) of each sighting among those of its step; steps are in order."""
-    first = np.searchsorted(step, step, side="left")
-    return np.arange(len(step)) - first
+def in_slots(
+    count: int, step: np.ndarray, seconds: np.ndarray, landmark: np.ndarray, sightings: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Value, landmark and since of so many steps, as `Steps` has them, of sightings (S, m) whose steps are in order."""
+    slot = np.arange(len(step)) - np.searchsorted(step, step, side="left")
+    shape = (count, int(slot.max(initial=0)) + 1)
+    value, index, since = np.full((*shape, sightings.shape[1]), np.nan), np.zeros(shape, int), np.full(shape, np.inf)
+    value[step, slot], index[step, slot], since[step, slot] = sightings, landmark, since_before(seconds, landmark)
+    return value, index, since
 
 
 def since_before(seconds: np.ndarray, landmark: np.ndarray) -> np.ndarray:

@@ -105,18 +105,6 @@ class WheeledRobot:
         distance = constant**2 + (share * value[..., 0]) ** 2
         return torch.stack([distance, torch.full_like(distance, self.noise.bearing**2)], dim=-1)
 
-    def place(self, state: Tensor, value: Tensor) -> Tensor:
-        """Where in the world (..., 2) a landmark is of which that was seen, the inverse of (9.45)."""
-        ahead, left = value[..., 0], value[..., 1]
-        if self.kind == "range-bearing":
-            ahead, left = value[..., 0] * torch.cos(value[..., 1]), value[..., 0] * torch.sin(value[..., 1])
-        scale = 1.0 / (1.0 + state[..., 9])
-        sine, cosine = torch.sin(state[..., 8]), torch.cos(state[..., 8])
-        ahead, left = scale * (cosine * ahead + sine * left), scale * (cosine * left - sine * ahead)
-        ahead, left = ahead + self.lever + state[..., 10], left + state[..., 11]
-        sine, cosine = torch.sin(state[..., 2]), torch.cos(state[..., 2])
-        return stack([state[..., 0] + cosine * ahead - sine * left, state[..., 1] + sine * ahead + cosine * left])
-
     def _seen_at(self, state: Tensor, landmark: Tensor) -> Tensor:
         """Metres ahead of the sensor and to its left (..., 2), (9.45)."""
         x, y = landmark[..., 0] - state[..., 0], landmark[..., 1] - state[..., 1]

@@ -64,11 +64,18 @@ def test_sightings_that_come_late_do_not_shift_the_poses_in_time():
 
 @pytest.mark.long
 def test_landmarks_of_an_unknown_map_are_found():
-    """No place of a landmark is told: they are moved in the recording, and the estimate is the same."""
+    """No place of a landmark is told: they are moved in the recording, and the estimate is the same.
+
+    In a world whose origin is far away it is the same, too.
+    """
     recording = drive(World(seconds=20.0, seed=8))
     estimate = localise_robots([recording], mapping=True)[1][0]
     moved = replace(recording, landmarks=recording.landmarks + 100.0)
     np.testing.assert_array_equal(localise_robots([moved], mapping=True)[1][0].pose, estimate.pose)
+    assert recording.truth is not None
+    shift = np.array([5e5, 5.6e6, 0.0])
+    far = replace(recording, truth=replace(recording.truth, poses=recording.truth.poses + shift))
+    np.testing.assert_allclose(localise_robots([far], mapping=True)[1][0].pose - shift, estimate.pose, atol=1e-6)
     found = score_map(estimate.map)
     assert found["landmarks"] == len(recording.landmarks)
     assert found["landmark_rmse_aligned"] < 0.15

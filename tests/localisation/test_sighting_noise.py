@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sigmaslam_localisation.sighting_noise import CORRELATION_SECONDS, NoiseScale, repetition
+from sigmaslam_localisation.sighting_noise import CORRELATION_SECONDS, learned_scale, repetition
 
 
 @pytest.mark.long
@@ -29,16 +29,16 @@ def test_a_first_sighting_is_not_inflated():
 @pytest.mark.long
 def test_the_scale_finds_the_variance_of_each_component():
     generator = torch.Generator().manual_seed(3)
-    noise, true = NoiseScale(torch.ones(1, 2, dtype=torch.float64)), torch.tensor([4.0, 0.04], dtype=torch.float64)
+    scale, true = torch.ones(1, 2, dtype=torch.float64), torch.tensor([4.0, 0.04], dtype=torch.float64)
     nominal, predicted = torch.tensor([0.5, 0.1]).double(), torch.tensor([0.3, 0.02]).double()
     history = []
     for _ in range(4000):
         deviation = torch.sqrt(predicted + true * nominal)
         innovation = deviation * torch.randn(1, 3, 2, generator=generator, dtype=torch.float64)
-        expected = (nominal * noise.scale)[:, None].expand(1, 3, 2)
+        expected = (nominal * scale)[:, None].expand(1, 3, 2)
         share, present = torch.ones(1, 3).double(), torch.tensor([[True, True, False]])
-        noise = noise.learn(innovation, predicted.expand(1, 3, 2), expected, share, present)
-        history.append(noise.scale[0])
+        scale = learned_scale(scale, innovation, predicted.expand(1, 3, 2), expected, share, present)
+        history.append(scale[0])
     # The second component hides below the belief's part: its scale is small, and known less well.
     found = torch.stack(history[2000:]).mean(dim=0)
     assert abs(float(found[0]) / 4.0 - 1) < 0.1
@@ -46,7 +46,7 @@ def test_the_scale_finds_the_variance_of_each_component():
 
 
 def test_nothing_is_learned_from_nothing():
-    noise = NoiseScale(torch.ones(2, 2))
+    scale = torch.ones(2, 2)
     value = torch.full((2, 3, 2), 9.0)
-    same = noise.learn(value, torch.ones(2, 3, 2), torch.ones(2, 3, 2), torch.ones(2, 3), torch.zeros(2, 3, dtype=bool))
-    assert torch.equal(same.scale, noise.scale)
+    ones, nothing = torch.ones(2, 3, 2), torch.zeros(2, 3, dtype=bool)
+    assert torch.equal(learned_scale(scale, value, ones, ones, torch.ones(2, 3), nothing), scale)

@@ -104,6 +104,7 @@ def export_step(
     step = _Step(bayes, motion, measurement, _complete(example), gate, robust)
     path = Path(path)
     # In place only when it is right: a graph that was there stays until then.
+    path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=path.parent) as folder:
         written = Path(folder) / path.name
         if path.suffix == ".hpp":

@@ -58,7 +58,8 @@ def is_flat(space: Space | None) -> bool:
 class Manifold(ABC):
     """A space with a tangent space at each point, whose arguments' sizes are checked.
 
-    Subclasses implement `_retract` and `_local`, which may rely on the sizes of their arguments.
+    Subclasses implement `_retract` and `_local`, which may rely on the sizes of their arguments. With an attribute
+    `parallel` that is true a filter carries covariances from one point to another as they are, as invariant ones do.
     """
 
     @property
