@@ -145,7 +145,12 @@ class Mapper:
             return None
         # With what neighbours share counted here, too, the truth is missed by more where the calibration is off.
         views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / fit.clustering)
-        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, blur=blur))
+        step, covariance = expected
+        if self.motion.is_inertial:
+            # Its velocity is that of the images, and off alike in all steps of a window: together they know one way.
+            shared = np.sqrt(np.repeat([self.config.window, 1.0], 3))
+            covariance = shared[:, None] * covariance * shared
+        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
