@@ -19,6 +19,7 @@ from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
@@ -62,6 +63,7 @@ class NewKeyframe:
         views: of the window's landmarks.
         origin: of the first one, the past pose relative to which `step_covariance` is.
         blur: of its image, as of `Keyframes.blur`.
+        spread: (6, 6) by which its pose is less certain than its views say, perturbed from the left in the world.
         rig_changed: the disparity offset is as unknown as at the start.
     """
 
@@ -73,6 +75,7 @@ class NewKeyframe:
     views: LandmarkViews = field(default_factory=LandmarkViews.empty)
     origin: int | None = None
     blur: float = 1.0
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     rig_changed: bool = False
 
 
@@ -114,7 +117,7 @@ class Mapper:
         blur: float,
         matches: GuidedMatches,
         expected: tuple[np.ndarray, np.ndarray],
-        is_spoilt: bool = False,
+        doubts: Doubts,
     ) -> KeyframeTracks | None:
         """Makes a tracked frame a keyframe when the landmarks of the last one fade, and the frame can replace it.
 
@@ -125,7 +128,7 @@ class Mapper:
             blur: of its image, as of `Keyframes.blur`.
             matches: with the window's landmarks.
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
-            is_spoilt: something that moves may have drawn the pose.
+            doubts: in the pose, which something that moves may have drawn.
         """
         self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
         self._last_count = fit.count
@@ -136,7 +139,7 @@ class Mapper:
             return None
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
-        is_bad = is_spoilt or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
+        is_bad = doubts.spoils_keyframe or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
         if share >= ACCEPTANCE.bad_keyframe_landmarks and (is_bad or is_blurred(frame.left)):
             return None
         view = frame.view
@@ -145,7 +148,9 @@ class Mapper:
             return None
         # With what neighbours share counted here, too, the truth is missed by more where the calibration is off.
         views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / fit.clustering)
-        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, blur=blur))
+        # Streaks hide what moves, and it draws the pose: frames that stand on the keyframe share that.
+        spread = matches.streaked * (doubts.spread + (1.0 - 1.0 / fit.clustering) * fit.relative)
+        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, blur=blur, spread=spread))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
@@ -169,6 +174,7 @@ class Mapper:
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)
         window.add_views(views)
+        window.keyframe_spread = new.spread
         index = self._add_landmarks(new.view, views, new.blur)
         slope = disparity_slopes(new.view.features.keypoints, new.view.disparity, index)
         view = replace(new.view, slope=slope, is_blurred=is_blurred(new.view.left))
