@@ -65,8 +65,7 @@ class KeyframeWindow:
         held_offset: what the disparity offset is taken to be in poses that are published.
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
         exceeded: (15,) bool, estimated errors beyond four standard deviations of their prior.
-        keyframe_spread: (6, 6) by which the last keyframe's pose is less certain than the posterior says, perturbed
-            from the left in the world: frames until the next one, which corrects it, share that.
+        keyframe_spread: (6, 6) that the last keyframe's posterior leaves out, perturbed from the left in the world.
         worse: factor by which errors that images show are larger than their standard deviations, 1 or more.
     """
 

@@ -67,8 +67,6 @@ def find_second_motion(
         return None
     expected = seen_from(window, rows, fit.pose)
     others = np.flatnonzero(~fit.inliers & np.isfinite(expected).all(axis=1))
-    if len(others) < MIN_POINTS:
-        return None
     cells, equal = image_cells(views.measurement[:, :2], camera.width, camera.height), np.ones(len(rows))
     possible, least = _among(others, len(rows)), 0.0
     if not moving:
