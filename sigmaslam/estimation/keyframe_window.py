@@ -65,7 +65,6 @@ class KeyframeWindow:
         held_offset: what the disparity offset is taken to be in poses that are published.
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
         exceeded: (15,) bool, estimated errors beyond four standard deviations of their prior.
-        keyframe_spread: (6, 6) that the last keyframe's posterior leaves out, perturbed from the left in the world.
         worse: factor by which errors that images show are larger than their standard deviations, 1 or more.
     """
 
@@ -87,7 +86,6 @@ class KeyframeWindow:
         self.expected, self.exceeded = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE, bool)
         self.held_offset = HeldOffset()
         self.board_disparity: float | None = None
-        self.keyframe_spread = np.zeros((6, 6))
         self.worse = 1.0
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)

@@ -19,7 +19,7 @@ from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
-from sigmaslam.slam.doubt import Doubts
+from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
@@ -63,7 +63,6 @@ class NewKeyframe:
         views: of the window's landmarks.
         origin: of the first one, the past pose relative to which `step_covariance` is.
         blur: of its image, as of `Keyframes.blur`.
-        spread: (6, 6) by which its pose is less certain than its views say, perturbed from the left in the world.
         rig_changed: the disparity offset is as unknown as at the start.
     """
 
@@ -75,7 +74,6 @@ class NewKeyframe:
     views: LandmarkViews = field(default_factory=LandmarkViews.empty)
     origin: int | None = None
     blur: float = 1.0
-    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     rig_changed: bool = False
 
 
@@ -148,9 +146,18 @@ class Mapper:
             return None
         # With what neighbours share counted here, too, the truth is missed by more where the calibration is off.
         views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / fit.clustering)
-        # Streaks hide what moves, and it draws the pose: frames that stand on the keyframe share that.
-        spread = matches.streaked * (doubts.spread + (1.0 - 1.0 / fit.clustering) * fit.relative)
-        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, blur=blur, spread=spread))
+        # Streaks hide what moves, and it draws the pose: frames that see the keyframe's landmarks share that.
+        drawn = 0.0 if Doubt.TIME in doubts.reasons else doubts.spread  # the image's own pose knows of no stamp
+        spread = matches.streaked * (drawn + (1.0 - 1.0 / fit.clustering) * fit.relative)
+        tracks = self.insert(NewKeyframe(admitted, timestamp, fit.pose, *expected, views, blur=blur))
+        self.keyframes.active[-1] = replace(self.keyframes.active[-1], spread=spread)
+        return tracks
+
+    def spread(self, seen: LandmarkViews) -> np.ndarray:
+        """(6, 6) by which a pose is less certain than its views say, as the keyframes of their landmarks are."""
+        keyframes, weight = self.keyframes.active, 1.0 / np.trace(seen.covariance[:, :2, :2], axis1=1, axis2=2)
+        share = np.bincount(self.window.landmarks.anchor[seen.landmark], weight, len(keyframes)) / weight.sum()
+        return np.asarray(np.tensordot(share, [keyframe.spread for keyframe in keyframes], 1))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
@@ -174,7 +181,6 @@ class Mapper:
         depth = self.camera.focal_baseline / disparity
         window.add_keyframe(new.pose, new.step, step_covariance, walk, depth, new.origin)
         window.add_views(views)
-        window.keyframe_spread = new.spread
         index = self._add_landmarks(new.view, views, new.blur)
         slope = disparity_slopes(new.view.features.keypoints, new.view.disparity, index)
         view = replace(new.view, slope=slope, is_blurred=is_blurred(new.view.left))

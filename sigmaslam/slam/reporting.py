@@ -70,7 +70,7 @@ class Reporter:
             absolute, by_error = covariance[part, part] + relative, state.common[part]
             offset = float(state.calibration[0])
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)
-        absolute = absolute + shift + (tracks is None) * self.window.keyframe_spread
+        absolute = absolute + shift
         # The filter knows the rectified camera; users know the left camera of their calibration.
         T_rectified_left = self.rectifier.T_rectified_left
         T_left_rectified = se3_inverse(T_rectified_left)

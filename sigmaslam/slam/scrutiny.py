@@ -134,10 +134,8 @@ class Scrutiny:
 
     def _is_other(self, second: SecondMotion, fit: FrameFit) -> bool:
         """Whether a sensor of motion rules the second motion out, and not the pose."""
-        if dead_reckoning(self._motion) is None:
-            return False
-        prediction = Prediction.of(self._window, self._motion)
-        return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
+        prediction, is_sensed = Prediction.of(self._window, self._motion), dead_reckoning(self._motion) is not None
+        return is_sensed and prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
     def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
         step = se3_inverse(self._window.posterior.poses[-1]) @ fit.pose

@@ -100,9 +100,8 @@ def find_second_motion(
     moves = moving is not None and nearer and (bool(moving) or (differs and many and share >= ACCEPTANCE.mover))
     if not (is_rival or moves):
         return None
-    pose = fit.pose @ relative.T_key_camera
     is_mover = nearer and (share < ACCEPTANCE.second_motion or np.median(landmarks.views[rows[agreeing]]) < CONFIRMED)
-    return SecondMotion(fit, pose, agreeing, expected[agreeing], departure, is_mover)
+    return SecondMotion(fit, fit.pose @ relative.T_key_camera, agreeing, expected[agreeing], departure, is_mover)
 
 
 def find_scene_behind(

@@ -297,4 +297,4 @@ class StereoTracker:
         if not matches.streaked:  # what streaks add to the noise is no scatter
             self._noise.adapt(fit.nis_per_dof)
         self._course.track(timestamp)
-        return fit
+        return fit.spread_by(self._mapper.spread(seen))
