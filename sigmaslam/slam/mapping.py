@@ -155,7 +155,7 @@ class Mapper:
 
     def spread(self, seen: LandmarkViews) -> np.ndarray:
         """(6, 6) by which a pose is less certain than its views say, as the keyframes of their landmarks are."""
-        keyframes, weight = self.keyframes.active, 1.0 / np.trace(seen.covariance[:, :2, :2], axis1=1, axis2=2)
+        keyframes, weight = self.keyframes.active, 1.0 / np.trace(seen.noise[:, :2, :2], axis1=1, axis2=2)
         share = np.bincount(self.window.landmarks.anchor[seen.landmark], weight, len(keyframes)) / weight.sum()
         return np.asarray(np.tensordot(share, [keyframe.spread for keyframe in keyframes], 1))
 
