@@ -29,6 +29,7 @@ class Keyframe:
         blur: of its image, as of `Keyframes.blur`.
         dense: disparities as of `dense_disparity`, while it is in the window; None where there are none.
         points: landmarks that it was the anchor of, in its frame, once it has left the window.
+        spread: (6, 6) by which its pose is less certain than its views say, perturbed from the left in the world.
     """
 
     id: int
@@ -38,6 +39,7 @@ class Keyframe:
     blur: float = 1.0
     dense: Deferred[np.ndarray] | None = None
     points: PointMap = field(default_factory=PointMap.empty)
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
     # As of `HangingKeyframe`: it hangs at itself.
     step, covariance = np.eye(4), np.zeros((6, 6))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -177,21 +176,16 @@ class Localiser:
 
     def fit_again(self, matches: GuidedMatches, fit: FrameFit, prediction: Prediction) -> FrameFit:
         """The pose of the same matches by a prediction that has become less certain; `fit` where there is none."""
-        pose, covariance = prediction.pose, prediction.covariance
-        return self.update.fit(matches.views, pose, covariance, self.config.min_inliers, fit.pose) or fit
+        views, least = matches.views, self.config.min_inliers
+        return self.update.fit(views, prediction.pose, prediction.covariance, least, fit.pose) or fit
 
     def fit_near(self, matches: GuidedMatches, prediction: Prediction) -> FrameFit | None:
         """Update from the prediction; most of what was found near it must agree."""
-        pose, covariance = prediction.pose, prediction.covariance
-        count, min_inliers = len(matches.probability), self.config.min_inliers
-        if count < min_inliers:
+        count, least = len(matches.probability), self.config.min_inliers
+        if count < least:
             return None
-        fit = self.update.fit(matches.views, pose, covariance, min_inliers)
+        fit = self.update.fit(matches.views, prediction.pose, prediction.covariance, least)
         return fit if fit is not None and fit.count >= ACCEPTANCE.guided_share * count else None
-
-    def _is_excluded(self, back: int, prediction: Prediction, T_key_camera: np.ndarray) -> bool:
-        """Whether a sensor's prediction rules out a pose (4, 4) relative to one of the last keyframes."""
-        return prediction.excludes(self.window.posterior.poses[back] @ T_key_camera)
 
     def _localise_anywhere(
         self,
@@ -208,12 +202,13 @@ class Localiser:
         """
         matches = GuidedMatches.empty()
         for back in range(1, min(ACCEPTANCE.last_keyframes, len(keyframes)) + 1):
-            excludes = None if dead_reckoning(self.motion) is None else partial(self._is_excluded, -back, prediction)
+            key, is_sensed = self.window.posterior.poses[-back], dead_reckoning(self.motion) is not None
+            excludes = (lambda step, key=key: prediction.excludes(key @ step)) if is_sensed else None
             relative = self.unguided.relative_pose_to(keyframes[-back], view, excludes)
             clock.lap("match")
             if relative is None:
                 continue
-            start = self.window.posterior.poses[-back] @ relative.T_key_camera
+            start = key @ relative.T_key_camera
             share = ACCEPTANCE.unguided_margin
             margin = np.diag(np.repeat([share * self.window.depth, share], 3) ** 2)
             uncertain = turn_covariance(start, relative.covariance + margin)

@@ -19,6 +19,7 @@ from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
@@ -114,7 +115,7 @@ class Mapper:
         blur: float,
         matches: GuidedMatches,
         expected: tuple[np.ndarray, np.ndarray],
-        is_spoilt: bool = False,
+        doubts: Doubts,
     ) -> KeyframeTracks | None:
         """Makes a tracked frame a keyframe when the landmarks of the last one fade, and the frame can replace it.
 
@@ -125,7 +126,7 @@ class Mapper:
             blur: of its image, as of `Keyframes.blur`.
             matches: with the window's landmarks.
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
-            is_spoilt: something that moves may have drawn the pose.
+            doubts: in the pose, which something that moves may have drawn.
         """
         self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
         self._last_count = fit.count
@@ -136,7 +137,7 @@ class Mapper:
             return None
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
-        is_bad = is_spoilt or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
+        is_bad = doubts.spoils_keyframe or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
         if share >= ACCEPTANCE.bad_keyframe_landmarks and (is_bad or is_blurred(frame.left)):
             return None
         view = frame.view
@@ -150,7 +151,18 @@ class Mapper:
             # Its velocity is that of the images, and off alike in all steps of a window: together they know one way.
             shared = np.sqrt(np.repeat([self.config.window, 1.0], 3))
             covariance = shared[:, None] * covariance * shared
-        return self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
+        # Streaks hide what moves, and it draws the pose: frames that see the keyframe's landmarks share that.
+        drawn = 0.0 if Doubt.TIME in doubts.reasons else doubts.spread  # the image's own pose knows of no stamp
+        spread = matches.streaked * (drawn + (1.0 - 1.0 / fit.clustering) * fit.relative)
+        tracks = self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
+        self.keyframes.active[-1] = replace(self.keyframes.active[-1], spread=spread)
+        return tracks
+
+    def spread(self, seen: LandmarkViews) -> np.ndarray:
+        """(6, 6) by which a pose is less certain than its views say, as the keyframes of their landmarks are."""
+        keyframes, weight = self.keyframes.active, 1.0 / np.trace(seen.noise[:, :2, :2], axis1=1, axis2=2)
+        share = np.bincount(self.window.landmarks.anchor[seen.landmark], weight, len(keyframes)) / weight.sum()
+        return np.asarray(np.tensordot(share, [keyframe.spread for keyframe in keyframes], 1))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.

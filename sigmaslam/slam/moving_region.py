@@ -41,7 +41,9 @@ class MovingRegion:
             self._places, found = lucas_kanade(self._left, left, self._places, guess, _WINDOW, _LEVELS)
             self._departure, self._age = self._places - at_rest, self._age + 1
             rests = are_one_place(np.linalg.norm(self._departure, axis=1))
-            self._keep(found & front & ~(rests & (self._age > self._patience)))
+            kept = found & front & ~(rests & (self._age > self._patience))
+            self._places, self._points = self._places[kept], self._points[kept]
+            self._departure, self._age = self._departure[kept], self._age[kept]
         self._left = left
 
     def add(self, places: np.ndarray, points: np.ndarray, departure: np.ndarray) -> None:
@@ -59,7 +61,3 @@ class MovingRegion:
             return np.zeros(len(places), bool)
         nearest = self._places[nearest_points(self._places, places, 1)[:, 0]]
         return np.asarray(np.linalg.norm(places - nearest, axis=1) <= share * self._radius)
-
-    def _keep(self, chosen: np.ndarray) -> None:
-        self._places, self._points = self._places[chosen], self._points[chosen]
-        self._departure, self._age = self._departure[chosen], self._age[chosen]

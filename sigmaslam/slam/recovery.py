@@ -71,10 +71,8 @@ class Recovery:
         if course.phase is Phase.WAITING_IN_MAP or not enough:
             return None
         if course.phase is Phase.WAITING:
-            seen_by_both = np.isfinite(view.disparity).mean()
             # Of an earlier run it was a keyframe.
-            known = self.start is not None
-            accepted = known or seen_by_both >= ACCEPTANCE.start_stereo_share
+            accepted = self.start is not None or np.isfinite(view.disparity).mean() >= ACCEPTANCE.start_stereo_share
             return self._start(view, timestamp) if accepted and not self._waits(view, timestamp) else None
         since = timestamp - course.tracked_at
         if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:

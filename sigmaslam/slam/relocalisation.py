@@ -68,14 +68,13 @@ class Relocaliser:
         min_points = self.admission.min_points
         if not view.has_stereo(min_points, self.min_inliers):
             return None
-        keyframes = self.keyframes
         # Features of the last one may be many where none of its landmarks is found again.
-        last = keyframes.active[-1:] if after_gap else []
-        for keyframe in [*last, *retrieve(view, _RETRIEVED, keyframes.left_long_ago(), keyframes.appearance)]:
+        last = self.keyframes.active[-1:] if after_gap else []
+        for keyframe in [*last, *retrieve(view, _RETRIEVED, self.keyframes.left_long_ago(), self.keyframes.appearance)]:
             relative, is_last = self.matcher.confirmed_pose_to(keyframe.view, view), keyframe in last
             if relative is None:
                 continue
-            pose = nearest_rigid(keyframes.poses([keyframe])[0] @ relative.T_key_camera)
+            pose = nearest_rigid(self.keyframes.poses([keyframe])[0] @ relative.T_key_camera)
             # Repeated texture agrees on other places: by a few dozens of matches, which the motion since the last image
             # excludes if that was guessed, or by hundreds, which it excludes if that was measured. Landmarks of the
             # last one spoke against its pose: both must speak for it.
@@ -87,8 +86,8 @@ class Relocaliser:
             admitted = view.only(self.admission.admit(view, pose, self.window))
             if not admitted.has_stereo(min_points, self.min_inliers):
                 continue
-            while keyframes.active:
-                keyframes.marginalise_oldest(spare=keyframe)
+            while self.keyframes.active:
+                self.keyframes.marginalise_oldest(spare=keyframe)
             covariance = from_origin(keyframe, relative).covariance
-            return Relocalisation(admitted, pose, covariance, keyframes.index(keyframe.origin))
+            return Relocalisation(admitted, pose, covariance, self.keyframes.index(keyframe.origin))
         return None

@@ -134,23 +134,22 @@ class Scrutiny:
 
     def _is_other(self, second: SecondMotion, fit: FrameFit) -> bool:
         """Whether a sensor of motion rules the second motion out, and not the pose."""
-        if dead_reckoning(self._motion) is None:
-            return False
-        prediction = Prediction.of(self._window, self._motion)
-        return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
+        prediction, is_sensed = Prediction.of(self._window, self._motion), dead_reckoning(self._motion) is not None
+        return is_sensed and prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
     def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
-        error = time_error(self._motion, fit.step, self._clock.interval, self._had_other_times)
-        # What goes on is an acceleration: images out of order jump to and fro.
+        # What goes on is an acceleration: images out of order jump to and fro, and once some came others may.
+        expects = self._had_other_times or self._last_error != 0.0
+        error = time_error(self._motion, fit.step, self._clock.interval, expects)
         is_other = error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0)
         excess = surprise(self._motion, fit.step)
         if is_other:
             self._motion.doubt_time(error * self._clock.interval)
         elif excess > 1.0:
             self._motion.widen(excess)
-        doubts.prediction_is_wrong, self._had_other_times = is_other or excess > 1.0, self._had_other_times or is_other
-        # Once images of another time came, what motion does not expect may be one.
-        if is_other or (self._had_other_times and self._motion.widened > 1.0):
+        doubts.prediction_is_wrong = is_other or excess > 1.0
+        self._had_other_times = self._had_other_times or (is_other and self._last_error != 0.0)
+        if is_other or (expects and self._motion.widened > 1.0):
             doubts.add(Doubt.TIME)
             # The pose at the stamp is the prediction, as uncertain as it was before, and the image's is off by a way.
             doubts.spread = doubts.spread + Prediction.of(self._window, self._motion).covariance

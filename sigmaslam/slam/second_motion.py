@@ -67,8 +67,6 @@ def find_second_motion(
         return None
     expected = seen_from(window, rows, fit.pose)
     others = np.flatnonzero(~fit.inliers & np.isfinite(expected).all(axis=1))
-    if len(others) < MIN_POINTS:
-        return None
     cells, equal = image_cells(views.measurement[:, :2], camera.width, camera.height), np.ones(len(rows))
     possible, least = _among(others, len(rows)), 0.0
     if not moving:
@@ -102,9 +100,8 @@ def find_second_motion(
     moves = moving is not None and nearer and (bool(moving) or (differs and many and share >= ACCEPTANCE.mover))
     if not (is_rival or moves):
         return None
-    pose = fit.pose @ relative.T_key_camera
     is_mover = nearer and (share < ACCEPTANCE.second_motion or np.median(landmarks.views[rows[agreeing]]) < CONFIRMED)
-    return SecondMotion(fit, pose, agreeing, expected[agreeing], departure, is_mover)
+    return SecondMotion(fit, fit.pose @ relative.T_key_camera, agreeing, expected[agreeing], departure, is_mover)
 
 
 def find_scene_behind(

@@ -216,7 +216,7 @@ class StereoTracker:
             blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))
             fit = self._correct(fit, of_matches, matches, timestamp)
             filtered = self._motion.state
-            tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected, doubts.spoils_keyframe)
+            tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected, doubts)
         elif is_repeated:
             status, tracks = "skipped", None
         elif change is not None:
@@ -296,4 +296,4 @@ class StereoTracker:
         if not matches.streaked:  # what streaks add to the noise is no scatter
             self._noise.adapt(fit.nis_per_dof)
         self._course.track(timestamp)
-        return fit
+        return fit.spread_by(self._mapper.spread(seen))

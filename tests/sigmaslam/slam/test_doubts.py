@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,10 +12,12 @@ import pytest
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
+from sigmaslam.slam import scrutiny
 from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
+from sigmaslam.slam.mapping import KeyframeTracks, Mapper
 from sigmaslam.slam.rig_change import RigChange
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import Estimate, StereoTracker
@@ -190,6 +193,58 @@ def test_a_jump_is_doubtful_once_images_of_another_time_came(demo: Demo, had_oth
     (estimate,) = track(tracker, frames[16:17])
     assert tracker._motion.widened > 1.0
     assert list(estimate.doubts) == [Doubt.TIME] * had_other_times
+
+
+@pytest.mark.parametrize(
+    ("errors", "doubted"),
+    [
+        ([0.0, -0.7, 0.0, 0.0], [1, 2]),
+        ([0.0, -0.7, -0.6, 0.0, 0.0], [1, 2, 3]),
+        ([0.0, 0.8, -0.9, 0.0, 0.0], [1, 2, 3, 4]),
+    ],
+    ids=["braked", "braked for two frames", "to and fro"],
+)
+def test_a_shaken_camera_delivers_no_images_of_another_time(
+    demo: Demo, monkeypatch: pytest.MonkeyPatch, errors: list[float], doubted: list[int]
+):
+    """A departure that does not come back is an acceleration: what motion does not expect later is no other time's."""
+    camera, frames, _ = demo
+    tracker = StereoTracker(camera)
+    track(tracker, frames[:8])
+    given = iter(errors)
+    monkeypatch.setattr(scrutiny, "time_error", lambda *others: next(given))
+    monkeypatch.setattr(scrutiny, "surprise", lambda *others: 1.5)
+    found = track(tracker, frames[8 : 8 + len(errors)])
+    assert [k for k, each in enumerate(found) if Doubt.TIME in each.doubts] == doubted
+
+
+def test_frames_that_see_landmarks_of_a_streaked_keyframe_share_what_its_pose_leaves_out(
+    demo: Demo, monkeypatch: pytest.MonkeyPatch
+):
+    """Poses are the same to the bit, and none is surer than without."""
+    camera, frames, _ = demo
+    insert = Mapper.insert_if_due
+
+    def insert_streaked(mapper: Mapper, *given: Any) -> KeyframeTracks | None:
+        given = *given[:2], replace(given[2], clustering=4.0), given[3], replace(given[4], streaked=True), *given[5:]
+        return insert(mapper, *given)
+
+    def insert_clustered(mapper: Mapper, *given: Any) -> KeyframeTracks | None:
+        return insert(mapper, *given[:2], replace(given[2], clustering=4.0), *given[3:])
+
+    runs = []
+    for change in (insert_clustered, insert_streaked):
+        monkeypatch.setattr(Mapper, "insert_if_due", change)
+        runs.append(track(StereoTracker(camera), frames[:FRAMES]))
+    first = next(k for k, each in enumerate(runs[0]) if k > 1 and each.tracks is not None)
+    for k, (plain, streaked) in enumerate(zip(*runs, strict=True)):
+        assert np.array_equal(plain.T_world_camera, streaked.T_world_camera)
+        more = streaked.covariance - plain.covariance
+        if k > first:
+            assert np.linalg.eigvalsh(more)[-1] > 0.0
+            assert np.linalg.eigvalsh(more)[0] > -1e-9 * np.trace(more)
+        else:
+            assert not more.any()
 
 
 def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Demo):
