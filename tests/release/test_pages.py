@@ -108,7 +108,7 @@ def stand_ins(installed: dict[str, str], demo_sequence: Path, tmp_path_factory: 
     write_stand_ins(demo_sequence, folder)
     shutil.copy(folder / CALIBRATION, folder / "kept.yaml")
     subprocess.run("sigmaslam track FOLDER --out tracked --tracks", shell=True, check=True, cwd=folder, env=installed)
-    for run in ("run", "again"):
+    for run in ("run", "again", "other_run"):
         shutil.copytree(folder / "tracked", folder / run)
     return folder
 
