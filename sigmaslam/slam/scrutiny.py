@@ -134,8 +134,10 @@ class Scrutiny:
 
     def _is_other(self, second: SecondMotion, fit: FrameFit) -> bool:
         """Whether a sensor of motion rules the second motion out, and not the pose."""
-        prediction, is_sensed = Prediction.of(self._window, self._motion), dead_reckoning(self._motion) is not None
-        return is_sensed and prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
+        if dead_reckoning(self._motion) is None:
+            return False
+        prediction = Prediction.of(self._window, self._motion)
+        return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
     def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
         # What goes on is an acceleration: images out of order jump to and fro, and once some came others may.
