@@ -1,14 +1,16 @@
 """A location sensor fused with the tracker's poses, loosely: the sensor's world and its mount are states.
 
-The error of the tracker's pose has two parts. The drift is a random walk in the tracker's world, whose steps have the
+The error of the tracker's pose has three parts. The drift is a random walk in the tracker's world, whose steps have the
 covariance by which that of the pose grows: errors of successive poses are correlated, and one reading corrects all
 later poses. The frame error is a share of the covariance that each frame's matches add, and a reading corrects it for
-that frame alone. The pose at the time of a reading is interpolated with constant velocity between two frames; the error
+that frame alone. Errors of the tracker's calibration are constant, and enter each pose as the tracker says: a scale that
+is wrong returns with the way back, as no random walk does. The pose at the time of a reading is interpolated with constant velocity between two frames; the error
 of this interpolation is not modelled.
 
 Fusion begins when readings and poses determine the transformation between the two worlds (`find_worlds`). The solution
 uses all readings and is repeated with each new one until the rotation is accurate enough to be linear. From then on
-each reading is one unscented update of 24 error states: drift, the sensor's world, its mount, the frame error.
+each reading is one unscented update of 39 error states: drift, the sensor's world, its mount, the calibration, the
+frame error.
 """
 
 from dataclasses import dataclass, replace
@@ -20,6 +22,7 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.estimation.gaussian import matrix_root, renew_part
 from sigmaslam.fusion.readings import Locations
 from sigmaslam.fusion.sensor_model import (
+    CALIBRATION,
     DRIFT,
     FRAME_ERROR,
     MODEL_SIZE,
@@ -31,7 +34,7 @@ from sigmaslam.fusion.sensor_model import (
     reading_jacobian,
     residuals,
 )
-from sigmaslam.geometry.se3 import nearest_rigid, se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
+from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_body, se3_exp, se3_inverse, se3_log, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.slam.estimate import Estimate
 
@@ -82,11 +85,13 @@ class _TrackedPose:
         pose: (4, 4) between the last two frames.
         share: of the time from the earlier frame to the last one, in [0, 1].
         frame_covariance: (6, 6) of the error of a frame alone, perturbed from the left in the world.
+        by_calibration: (6, 15) how errors of the calibration enter its error, perturbed likewise.
     """
 
     pose: np.ndarray
     share: float
     frame_covariance: np.ndarray
+    by_calibration: np.ndarray
 
 
 class LocationFilter:
@@ -113,8 +118,9 @@ class LocationFilter:
         self._belief = self._belief_when_tracked = _Belief(None, np.zeros((6, 6)))
         self._last: Estimate | None = None
         self._was_tracked = True
-        # Readings for the solution of the worlds: row, pose, and the covariances of drift and frame error.
-        self._unsolved: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+        # Readings for the solution of the worlds: row, pose, covariances of drift and frame error, and what the
+        # calibration does to the pose.
+        self._unsolved: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
         self._trajectory: list[tuple[float, np.ndarray]] = []
 
     @property
@@ -171,7 +177,10 @@ class LocationFilter:
             done = share
             step = se3_log(se3_inverse(before.T_world_camera) @ estimate.T_world_camera)
             pose = before.T_world_camera @ se3_exp(share * step)
-            self._fuse_reading(row, _TrackedPose(pose, share, frame_covariance), float(estimate.timestamp))
+            by_calibration = (1.0 - share) * _world_by_calibration(before) + share * _world_by_calibration(estimate)
+            self._fuse_reading(
+                row, _TrackedPose(pose, share, frame_covariance, by_calibration), float(estimate.timestamp)
+            )
         self._grow_drift((1.0 - done) * growth)
         if tracked:
             self._belief_when_tracked = self._belief
@@ -221,16 +230,18 @@ class LocationFilter:
         self._belief = _Belief(state, drift_covariance)
 
     def _correct(self, estimate: Estimate) -> Estimate:
-        """The estimate with drift and frame error taken out."""
+        """The estimate with drift, frame error and what the calibration does to it taken out."""
         state = self._belief.state
         if state is None:
             return estimate
-        pose = nearest_rigid(se3_exp(state.drift + state.frame_error) @ estimate.T_world_camera)
-        both = np.eye(STATE_SIZE)[DRIFT] + np.eye(STATE_SIZE)[FRAME_ERROR]
+        whole = np.eye(STATE_SIZE)[DRIFT] + np.eye(STATE_SIZE)[FRAME_ERROR]
+        whole[:, CALIBRATION] = by_calibration = _world_by_calibration(estimate)
+        error = state.drift + state.frame_error + by_calibration @ state.calibration
+        pose = nearest_rigid(se3_exp(error) @ estimate.T_world_camera)
         return replace(
             estimate,
             T_world_camera=pose,
-            covariance=se3_body(pose, both @ state.covariance @ both.T),
+            covariance=se3_body(pose, whole @ state.covariance @ whole.T),
             frame_covariance=se3_body(pose, state.covariance[FRAME_ERROR, FRAME_ERROR]),
         )
 
@@ -257,7 +268,9 @@ class LocationFilter:
             return
         share = tracked.share
         frame_covariance = (share**2 + (1.0 - share) ** 2) * tracked.frame_covariance
-        self._unsolved.append((row, tracked.pose, self._belief.drift_covariance, frame_covariance))
+        self._unsolved.append(
+            (row, tracked.pose, self._belief.drift_covariance, frame_covariance, tracked.by_calibration)
+        )
         model = None if self._belief.state is None else self._belief.state.model
         state = find_worlds(self._posed_readings(), self._belief.drift_covariance, self._on_object, model)
         self._belief = _Belief(state, self._belief.drift_covariance)
@@ -272,12 +285,10 @@ class LocationFilter:
 
     def _posed_readings(self) -> PosedReadings:
         """The readings for the solution of the worlds."""
-        rows, poses, drift, frame_error = zip(*self._unsolved, strict=True)
+        rows, *tracked = zip(*self._unsolved, strict=True)
         readings, index = self._readings, list(rows)
         return PosedReadings(
-            np.stack(poses),
-            np.stack(drift),
-            np.stack(frame_error),
+            *(np.stack(each) for each in tracked),
             readings.positions[index],
             None if readings.rotations is None else readings.rotations[index],
             readings.covariances[index],
@@ -291,6 +302,7 @@ class LocationFilter:
         points = np.concatenate([root.T, -root.T])
         errors = points[:, :MODEL_SIZE].copy()
         errors[:, DRIFT] += state.drift + share * (points[:, FRAME_ERROR] + state.frame_error)
+        errors[:, DRIFT] += (points[:, CALIBRATION] + state.calibration) @ tracked.by_calibration.T
         residual = residuals(state.model.expect(pose, errors), readings.positions[row], rotation)
         innovation = residual.mean(axis=0)
         deviation = (innovation - residual) / np.sqrt(len(points))
@@ -311,6 +323,7 @@ class LocationFilter:
         state = FusionState(
             state.model.corrected(step[:MODEL_SIZE]),
             state.drift + step[DRIFT],
+            state.calibration + step[CALIBRATION],
             state.frame_error + step[FRAME_ERROR],
             0.5 * (covariance + covariance.T),
         )
@@ -325,4 +338,10 @@ def _world_drift_covariance(estimate: Estimate) -> np.ndarray:
 
 def _drift_covariance(estimate: Estimate) -> np.ndarray:
     """(6, 6) covariance of the tracker's drift in the camera's frame; errors of its calibration are no random walk."""
-    return estimate.matching_covariance - _INDEPENDENT_SHARE * estimate.frame_covariance
+    offset = estimate.by_calibration[:, 0]
+    return estimate.matching_covariance - np.outer(offset, offset) - _INDEPENDENT_SHARE * estimate.frame_covariance
+
+
+def _world_by_calibration(estimate: Estimate) -> np.ndarray:
+    """(6, 15) how errors of the calibration enter the pose's error, perturbed from the left in the world."""
+    return np.asarray(se3_adjoint(estimate.T_world_camera) @ estimate.by_calibration)

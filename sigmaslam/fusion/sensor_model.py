@@ -12,15 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sigmaslam.estimation.gaussian import project_covariance
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.geometry.se3 import nearest_rotation, rigid_motion, rotation_log, se3_exp, se3_inverse
 from sigmaslam.table import Table
 
 # Slices of the error states. The tracker's drift and the error of the last frame perturb from the left in the tracker's
-# world; A and B are perturbed from the right.
-DRIFT, SENSOR_WORLD, MOUNT, FRAME_ERROR = slice(0, 6), slice(6, 12), slice(12, 18), slice(18, 24)
-# A reading depends on the first 18 states: drift, A and B.
-MODEL_SIZE, STATE_SIZE = 18, 24
-_WORLDS = slice(6, 18)
+# world; A and B are perturbed from the right. Errors of the tracker's calibration have variance one at first.
+DRIFT, SENSOR_WORLD, MOUNT = slice(0, 6), slice(6, 12), slice(12, 18)
+CALIBRATION, FRAME_ERROR = slice(18, 18 + CALIBRATION_SIZE), slice(18 + CALIBRATION_SIZE, 24 + CALIBRATION_SIZE)
+# A reading depends on the first 18 states: the tracker's error, of which only the drift is one of them, A and B.
+MODEL_SIZE, STATE_SIZE = 18, FRAME_ERROR.stop
+_WORLDS, _SOLVED = slice(6, 18), slice(0, CALIBRATION.stop)
 # A solution for A and B is accepted if the standard deviation of A's rotation, radians, and the squared residuals per
 # component are at most these. Drift beyond the tracker's covariance may raise the residuals.
 _MAX_ROTATION_SIGMA, _MAX_MISFIT = 0.15, 9.0
@@ -73,6 +75,7 @@ class PosedReadings(Table):
         poses: (N, 4, 4) of the camera in the tracker's world.
         drift: (N, 6, 6) covariance of the drift of the poses, perturbed from the left, growing from one to the next.
         frame_error: (N, 6, 6) covariance of the error of each frame alone, perturbed from the left.
+        by_calibration: (N, 6, 15) how the calibration's errors, of variance one, enter the poses', likewise.
         positions, rotations: (N, 3), (N, 3, 3) or None.
         covariances: (N, m, m) of the readings.
     """
@@ -80,6 +83,7 @@ class PosedReadings(Table):
     poses: np.ndarray
     drift: np.ndarray
     frame_error: np.ndarray
+    by_calibration: np.ndarray
     positions: np.ndarray
     rotations: np.ndarray | None
     covariances: np.ndarray
@@ -92,12 +96,14 @@ class FusionState:
     Attributes:
         model: the sensor's world and mount.
         drift: (6,) of the tracker.
+        calibration: (15,) errors of the tracker's calibration, in their standard deviations.
         frame_error: (6,) error of the last frame alone, beside the drift.
-        covariance: (24, 24) of all error states.
+        covariance: (39, 39) of all error states.
     """
 
     model: SensorModel
     drift: np.ndarray
+    calibration: np.ndarray
     frame_error: np.ndarray
     covariance: np.ndarray
 
@@ -168,10 +174,11 @@ def _rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _solve(
     readings: PosedReadings, drift: np.ndarray, start: SensorModel, prior: np.ndarray
 ) -> tuple[FusionState, float]:
-    """Posterior of the tracker's drift now, A and B, and the misfit, the sum of squared whitened residuals."""
+    """Posterior of the tracker's drift now, its calibration, A and B, and the misfit, the sum of squared whitened residuals."""
     count, width = readings.covariances.shape[:2]
     # The drift is a random walk: the covariance of two drifts is that of the earlier one.
     shared = readings.drift[np.minimum(np.arange(count)[:, None], np.arange(count)[None])]
+    shared = shared + readings.by_calibration[:, None] @ readings.by_calibration.swapaxes(1, 2)[None]
     worlds = np.zeros(MODEL_SIZE - 6)
     for _ in range(_STEPS):
         model = start.corrected(np.concatenate([np.zeros(6), worlds]))
@@ -188,18 +195,20 @@ def _solve(
         before, worlds = worlds, prior @ by_worlds.T @ np.linalg.solve(S, residual_at_prior)
         if np.abs(worlds - before).max() < _CONVERGED:
             break
-    cross = np.concatenate(
-        [np.einsum("ibc,iac->bia", readings.drift, by_drift).reshape(6, -1), prior @ by_worlds.T], axis=0
-    )
+    with_drift = np.einsum("ibc,iac->bia", readings.drift, by_drift).reshape(6, -1)
+    with_calibration = np.einsum("ibc,iab->cia", readings.by_calibration, by_drift).reshape(CALIBRATION_SIZE, -1)
+    cross = np.concatenate([with_drift, prior @ by_worlds.T, with_calibration])
     gain = np.linalg.solve(S, cross.T).T
     covariance = np.zeros((STATE_SIZE, STATE_SIZE))
     covariance[DRIFT, DRIFT], covariance[_WORLDS, _WORLDS] = drift, prior
-    covariance[:MODEL_SIZE, :MODEL_SIZE] -= gain @ cross.T
+    covariance[CALIBRATION, CALIBRATION] = np.eye(CALIBRATION_SIZE)
+    covariance[_SOLVED, _SOLVED] -= gain @ cross.T
     model = start.corrected(np.concatenate([np.zeros(6), worlds]))
     residual = _residuals_without_drift(model, readings)
     misfit = float(residual.ravel() @ np.linalg.solve(noise, residual.ravel()))
     covariance = 0.5 * (covariance + covariance.T)
-    return FusionState(model, gain[DRIFT] @ residual_at_prior, np.zeros(6), covariance), misfit
+    mean = gain @ residual_at_prior
+    return FusionState(model, mean[DRIFT], mean[CALIBRATION], np.zeros(6), covariance), misfit
 
 
 def _residuals_without_drift(model: SensorModel, readings: PosedReadings) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.inertial_estimate import InertialEstimate
 from sigmaslam.slam.mapping import KeyframeTracks
@@ -49,6 +50,9 @@ class Estimate:
             in the frame that defines the world, infinite variances before it.
         matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
             errors of the calibration.
+        by_calibration: (6, 15) how errors of the calibration, of variance one and in the order of
+            `sigmaslam.estimation.calibration_errors.ERRORS`, enter the pose's error in the camera's own frame. They
+            are the same in all frames. That of the disparity offset is a part of `matching_covariance`.
         status: "starting"; "tracking"; "doubtful": tracked, but `doubts` speak against the pose, and the covariance
             holds what they may make of it; "ambiguous": likewise, and another pose explains the image about as well;
             "lost"; "inertial" or "odometry": lost by images, and predicted by that sensor; "skipped": one of the images
@@ -82,6 +86,7 @@ class Estimate:
     calibration: CalibrationEstimate
     milliseconds: dict[str, float] = field(default_factory=dict)
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    by_calibration: np.ndarray = field(default_factory=lambda: np.zeros((6, CALIBRATION_SIZE)))
     tracks: KeyframeTracks | None = None
     relative_poses: RelativePoses = field(default_factory=RelativePoses.empty)
     doubts: tuple[Doubt, ...] = ()
