@@ -3,9 +3,9 @@
 The error of the tracker's pose has three parts. The drift is a random walk in the tracker's world, whose steps have the
 covariance by which that of the pose grows: errors of successive poses are correlated, and one reading corrects all
 later poses. The frame error is a share of the covariance that each frame's matches add, and a reading corrects it for
-that frame alone. Errors of the tracker's calibration are constant, and enter each pose as the tracker says: a scale that
-is wrong returns with the way back, as no random walk does. The pose at the time of a reading is interpolated with constant velocity between two frames; the error
-of this interpolation is not modelled.
+that frame alone. Errors of the tracker's calibration are constant and enter each pose as the tracker says: a wrong scale
+is undone on the way back. The pose at the time of a reading is interpolated with constant velocity between two frames;
+the error of this interpolation is not modelled.
 
 Fusion begins when readings and poses determine the transformation between the two worlds (`find_worlds`). The solution
 uses all readings and is repeated with each new one until the rotation is accurate enough to be linear. From then on
@@ -285,10 +285,13 @@ class LocationFilter:
 
     def _posed_readings(self) -> PosedReadings:
         """The readings for the solution of the worlds."""
-        rows, *tracked = zip(*self._unsolved, strict=True)
+        rows, poses, drift, frame_error, by_calibration = zip(*self._unsolved, strict=True)
         readings, index = self._readings, list(rows)
         return PosedReadings(
-            *(np.stack(each) for each in tracked),
+            np.stack(poses),
+            np.stack(drift),
+            np.stack(frame_error),
+            np.stack(by_calibration),
             readings.positions[index],
             None if readings.rotations is None else readings.rotations[index],
             readings.covariances[index],
@@ -338,8 +341,7 @@ def _world_drift_covariance(estimate: Estimate) -> np.ndarray:
 
 def _drift_covariance(estimate: Estimate) -> np.ndarray:
     """(6, 6) covariance of the tracker's drift in the camera's frame; errors of its calibration are no random walk."""
-    offset = estimate.by_calibration[:, 0]
-    return estimate.matching_covariance - np.outer(offset, offset) - _INDEPENDENT_SHARE * estimate.frame_covariance
+    return estimate.matching_covariance - _INDEPENDENT_SHARE * estimate.frame_covariance
 
 
 def _world_by_calibration(estimate: Estimate) -> np.ndarray:

@@ -178,7 +178,8 @@ def _solve(
     count, width = readings.covariances.shape[:2]
     # The drift is a random walk: the covariance of two drifts is that of the earlier one.
     shared = readings.drift[np.minimum(np.arange(count)[:, None], np.arange(count)[None])]
-    shared = shared + readings.by_calibration[:, None] @ readings.by_calibration.swapaxes(1, 2)[None]
+    by_calibration = readings.by_calibration
+    shared = shared + by_calibration[:, None] @ by_calibration.swapaxes(1, 2)[None]
     worlds = np.zeros(MODEL_SIZE - 6)
     for _ in range(_STEPS):
         model = start.corrected(np.concatenate([np.zeros(6), worlds]))
@@ -196,7 +197,7 @@ def _solve(
         if np.abs(worlds - before).max() < _CONVERGED:
             break
     with_drift = np.einsum("ibc,iac->bia", readings.drift, by_drift).reshape(6, -1)
-    with_calibration = np.einsum("ibc,iab->cia", readings.by_calibration, by_drift).reshape(CALIBRATION_SIZE, -1)
+    with_calibration = np.einsum("ibc,iab->cia", by_calibration, by_drift).reshape(CALIBRATION_SIZE, -1)
     cross = np.concatenate([with_drift, prior @ by_worlds.T, with_calibration])
     gain = np.linalg.solve(S, cross.T).T
     covariance = np.zeros((STATE_SIZE, STATE_SIZE))

@@ -9,7 +9,6 @@ import numpy as np
 from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
-from sigmaslam.estimation.gaussian import step_with
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.published_state import considered_growth, published_state
 from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
@@ -70,7 +69,6 @@ class Reporter:
             pose, relative = prediction.pose, prediction.covariance
             absolute, by_error = covariance[part, part] + relative, state.common[part]
             offset = float(state.calibration[0])
-        by_offset = step_with(covariance, part, 0, np.sqrt(covariance[0, 0]))
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)
         absolute = absolute + shift
         # The filter knows the rectified camera; users know the left camera of their calibration.
@@ -97,7 +95,7 @@ class Reporter:
             calibration=self._describe_calibration(state, fit),
             milliseconds=milliseconds,
             frame_covariance=0.5 * (frame_covariance + frame_covariance.T),
-            by_calibration=np.column_stack([adjoint @ by_offset, by_error[:, 1:]]),
+            by_calibration=by_error,
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
             relative_poses=self.relative_poses.report(timestamp, state, fit if tracks is None else None),

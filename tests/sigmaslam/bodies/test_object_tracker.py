@@ -17,6 +17,7 @@ from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.trajectory_files import read_kitti, write_kitti
+from sigmaslam_benchmarks.rendered_camera import draw_calibration
 from sigmaslam_evaluation.evaluation_result import Evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.quantiles import WITHIN_3_SIGMA
@@ -199,6 +200,8 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
     """`sigmaslam train render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor of 0.17 mm, 0.2 deg.
 
     Means of five draws: noise of one grey level in 5 % of the pixels moves the rotation between 0.2 and 0.3 degrees.
+    The sensor is on a rig whose calibration is off by its sigmas: places of the exact one, 0.09 mm off where 1.4 mm are
+    claimed, are better than any filter that is told those sigmas can know (0.16 mm with the sensor).
     """
     pytest.importorskip("torch")
     from sigmaslam_synthetic.render_sequence import write_sequence
@@ -212,25 +215,29 @@ def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_pat
     camera = simulation.path.poses(np.zeros(1))[0]
     truth = np.stack([se3_inverse(camera) @ body.pose(time) for time in times])
 
-    alone, fused = [], []
+    exact, alone, fused = [], [], []
     for draw in range(5):
         add_noise(folder, draw)
         sequence = open_sequence(folder, "kitti")
-        out = tmp_path / f"alone{draw}", tmp_path / f"fused{draw}"
+        out = [tmp_path / f"{name}{draw}" for name in ("exact", "alone", "fused")]
         assert track(sequence, out[0], track_object=BOX)["lost"] == 0
+        sequence.camera = draw_calibration(sequence.camera, np.random.default_rng(draw))
+        assert track(sequence, out[1], track_object=BOX)["lost"] == 0
         readings = sense(truth, times, draw, 1e-4, 2e-3)
-        summary = track(sequence, out[1], track_object=BOX, location=readings)
+        summary = track(sequence, out[2], track_object=BOX, location=readings)
         assert summary["location"]["ready"] is not None
-        for run, results in zip(out, (alone, fused), strict=True):
+        for run, results in zip(out, (exact, alone, fused), strict=True):
             results.append(evaluate_run(run, folder / "poses_object.txt", plot=False))
 
-    assert alone[0].path_length > 0.1
-    assert max(each.ate.rmse for each in alone) < 0.002
-    assert nees(alone) < 4
-    assert turned(alone) < 0.25
-    # What the first frame is off by is in both; places are good to the sensor's 0.17 mm without it (0.17 beside 0.12).
-    assert displaced(fused) < 1.5 * displaced(alone)
-    assert turned(fused) < turned(alone)
+    assert exact[0].path_length > 0.1
+    assert max(each.ate.rmse for each in [*exact, *alone]) < 0.002
+    assert nees(exact) < 4
+    assert 0.5 < nees(alone) < 2.0
+    assert turned(exact) < 0.25
+    # 0.58 mm, 1.50 without the sensor; what the first frame is off by is in both.
+    assert displaced(fused) < 0.6 * displaced(alone)
+    assert turned(fused) < 0.8 * turned(alone)
+    # 20 before errors of the calibration were states of the fusion.
     assert 0.5 < nees(fused) < 2.0
 
 
