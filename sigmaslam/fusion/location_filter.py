@@ -3,9 +3,9 @@
 The error of the tracker's pose has three parts. The drift is a random walk in the tracker's world, whose steps have the
 covariance by which that of the pose grows: errors of successive poses are correlated, and one reading corrects all
 later poses. The frame error is a share of the covariance that each frame's matches add, and a reading corrects it for
-that frame alone. Errors of the tracker's calibration are constant and enter each pose as the tracker says: a wrong scale
-is undone on the way back. The pose at the time of a reading is interpolated with constant velocity between two frames;
-the error of this interpolation is not modelled.
+that frame alone. Errors of the tracker's calibration are constant and enter each pose as the tracker says: a wrong
+scale is undone on the way back. The pose at the time of a reading is interpolated with constant velocity between two
+frames; the error of this interpolation is not modelled.
 
 Fusion begins when readings and poses determine the transformation between the two worlds (`find_worlds`). The solution
 uses all readings and is repeated with each new one until the rotation is accurate enough to be linear. From then on
@@ -19,15 +19,15 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
-from sigmaslam.estimation.gaussian import matrix_root, renew_part
+from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.fusion.readings import Locations
 from sigmaslam.fusion.sensor_model import (
     CALIBRATION,
     DRIFT,
     FRAME_ERROR,
-    MODEL_SIZE,
     SENSOR_WORLD,
     STATE_SIZE,
+    WORLDS,
     FusionState,
     PosedReadings,
     find_worlds,
@@ -118,9 +118,8 @@ class LocationFilter:
         self._belief = self._belief_when_tracked = _Belief(None, np.zeros((6, 6)))
         self._last: Estimate | None = None
         self._was_tracked = True
-        # Readings for the solution of the worlds: row, pose, covariances of drift and frame error, and what the
-        # calibration does to the pose.
-        self._unsolved: list[tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+        # Readings for the solution of the worlds, each a table of one row.
+        self._unsolved: list[PosedReadings] = []
         self._trajectory: list[tuple[float, np.ndarray]] = []
 
     @property
@@ -200,9 +199,7 @@ class LocationFilter:
         """A new frame: its frame error, of covariance (6, 6), is independent of the one before."""
         state = self._belief.state
         if state is not None:
-            covariance = renew_part(state.covariance, FRAME_ERROR, frame_covariance)
-            state = replace(state, frame_error=np.zeros(6), covariance=covariance)
-            self._belief = replace(self._belief, state=state)
+            self._belief = replace(self._belief, state=state.renewed(FRAME_ERROR, frame_covariance))
 
     def _grow_drift(self, growth: np.ndarray) -> None:
         state = self._belief.state
@@ -224,10 +221,7 @@ class LocationFilter:
         # The drift of these readings is not a part of the drift from now on.
         self._unsolved.clear()
         drift_covariance, state = _world_drift_covariance(estimate), self._belief.state
-        if state is not None:
-            covariance = renew_part(state.covariance, DRIFT, drift_covariance)
-            state = replace(state, drift=np.zeros(6), covariance=covariance)
-        self._belief = _Belief(state, drift_covariance)
+        self._belief = _Belief(None if state is None else state.renewed(DRIFT, drift_covariance), drift_covariance)
 
     def _correct(self, estimate: Estimate) -> Estimate:
         """The estimate with drift, frame error and what the calibration does to it taken out."""
@@ -235,9 +229,8 @@ class LocationFilter:
         if state is None:
             return estimate
         whole = np.eye(STATE_SIZE)[DRIFT] + np.eye(STATE_SIZE)[FRAME_ERROR]
-        whole[:, CALIBRATION] = by_calibration = _world_by_calibration(estimate)
-        error = state.drift + state.frame_error + by_calibration @ state.calibration
-        pose = nearest_rigid(se3_exp(error) @ estimate.T_world_camera)
+        whole[:, CALIBRATION] = _world_by_calibration(estimate)
+        pose = nearest_rigid(se3_exp(whole @ state.error) @ estimate.T_world_camera)
         return replace(
             estimate,
             T_world_camera=pose,
@@ -266,14 +259,15 @@ class LocationFilter:
         if self._belief.state is not None and not self._unsolved:
             self._update(self._belief.state, row, tracked)
             return
-        share = tracked.share
+        share, drift_covariance = tracked.share, self._belief.drift_covariance
         frame_covariance = (share**2 + (1.0 - share) ** 2) * tracked.frame_covariance
-        self._unsolved.append(
-            (row, tracked.pose, self._belief.drift_covariance, frame_covariance, tracked.by_calibration)
-        )
+        errors = drift_covariance, frame_covariance, tracked.by_calibration
+        (position, rotation, noise), of_tracker = self._readings.row(row), (each[None] for each in (tracked.pose, *errors))
+        rotations = None if rotation is None else rotation[None]
+        self._unsolved.append(PosedReadings(*of_tracker, position[None], rotations, noise[None]))
         model = None if self._belief.state is None else self._belief.state.model
-        state = find_worlds(self._posed_readings(), self._belief.drift_covariance, self._on_object, model)
-        self._belief = _Belief(state, self._belief.drift_covariance)
+        state = find_worlds(PosedReadings.concatenate(self._unsolved), drift_covariance, self._on_object, model)
+        self._belief = _Belief(state, drift_covariance)
         self._renew_frame_error(tracked.frame_covariance)
         full = len(self._unsolved) >= _MAX_READINGS
         if state is not None:
@@ -283,37 +277,21 @@ class LocationFilter:
         elif full:
             self._unsolved = self._unsolved[::2]
 
-    def _posed_readings(self) -> PosedReadings:
-        """The readings for the solution of the worlds."""
-        rows, poses, drift, frame_error, by_calibration = zip(*self._unsolved, strict=True)
-        readings, index = self._readings, list(rows)
-        return PosedReadings(
-            np.stack(poses),
-            np.stack(drift),
-            np.stack(frame_error),
-            np.stack(by_calibration),
-            readings.positions[index],
-            None if readings.rotations is None else readings.rotations[index],
-            readings.covariances[index],
-        )
-
     def _update(self, state: FusionState, row: int, tracked: _TrackedPose) -> None:
         """Unscented update by a reading."""
-        readings, pose, share = self._readings, tracked.pose, tracked.share
-        rotation = None if readings.rotations is None else readings.rotations[row]
+        (position, rotation, noise), pose, share = self._readings.row(row), tracked.pose, tracked.share
         root = np.sqrt(STATE_SIZE) * matrix_root(state.covariance)
         points = np.concatenate([root.T, -root.T])
-        errors = points[:, :MODEL_SIZE].copy()
-        errors[:, DRIFT] += state.drift + share * (points[:, FRAME_ERROR] + state.frame_error)
-        errors[:, DRIFT] += (points[:, CALIBRATION] + state.calibration) @ tracked.by_calibration.T
-        residual = residuals(state.model.expect(pose, errors), readings.positions[row], rotation)
+        errors = points + state.error
+        errors[:, DRIFT] += share * errors[:, FRAME_ERROR] + errors[:, CALIBRATION] @ tracked.by_calibration.T
+        residual = residuals(state.model.expect(pose, errors), position, rotation)
         innovation = residual.mean(axis=0)
         deviation = (innovation - residual) / np.sqrt(len(points))
         cross = points.T @ deviation / np.sqrt(len(points))
-        by_drift = reading_jacobian(state.model, pose, readings.positions[row], rotation)[:, DRIFT]
+        by_drift = reading_jacobian(state.model, pose, position, rotation)[:, DRIFT]
         predicted = deviation.T @ deviation
         # The error of the earlier frame is not a state: it counts as noise.
-        noise = readings.covariances[row] + (1.0 - share) ** 2 * by_drift @ tracked.frame_covariance @ by_drift.T
+        noise = noise + (1.0 - share) ** 2 * by_drift @ tracked.frame_covariance @ by_drift.T
         squared = float(innovation @ np.linalg.solve(predicted + noise, innovation))
         # A reading beyond the gate is weakened until it lies on the gate.
         gate = CHI_SQUARE_999[len(innovation)]
@@ -323,13 +301,9 @@ class LocationFilter:
         gain = np.linalg.solve(predicted + noise, cross.T).T
         step = gain @ innovation
         covariance = state.covariance - gain @ cross.T
-        state = FusionState(
-            state.model.corrected(step[:MODEL_SIZE]),
-            state.drift + step[DRIFT],
-            state.calibration + step[CALIBRATION],
-            state.frame_error + step[FRAME_ERROR],
-            0.5 * (covariance + covariance.T),
-        )
+        error = state.error + step
+        error[WORLDS] = 0.0  # which the model takes
+        state = FusionState(state.model.corrected(step), error, 0.5 * (covariance + covariance.T))
         self._belief = replace(self._belief, state=state)
 
 

@@ -49,6 +49,10 @@ class Locations:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def row(self, index: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """Position, rotation and covariance of one reading."""
+        return self.positions[index], None if self.rotations is None else self.rotations[index], self.covariances[index]
+
 
 def read_locations(path: Path) -> Locations:
     """Reads a CSV file of `sigmaslam track --location`.

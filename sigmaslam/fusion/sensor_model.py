@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sigmaslam.estimation.gaussian import project_covariance
+from sigmaslam.estimation.gaussian import project_covariance, renew_part
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.geometry.se3 import nearest_rotation, rigid_motion, rotation_log, se3_exp, se3_inverse
 from sigmaslam.table import Table
@@ -22,7 +22,7 @@ DRIFT, SENSOR_WORLD, MOUNT = slice(0, 6), slice(6, 12), slice(12, 18)
 CALIBRATION, FRAME_ERROR = slice(18, 18 + CALIBRATION_SIZE), slice(18 + CALIBRATION_SIZE, 24 + CALIBRATION_SIZE)
 # A reading depends on the first 18 states: the tracker's error, of which only the drift is one of them, A and B.
 MODEL_SIZE, STATE_SIZE = 18, FRAME_ERROR.stop
-_WORLDS, _SOLVED = slice(6, 18), slice(0, CALIBRATION.stop)
+WORLDS, _SOLVED = slice(6, 18), slice(0, CALIBRATION.stop)
 # A solution for A and B is accepted if the standard deviation of A's rotation, radians, and the squared residuals per
 # component are at most these. Drift beyond the tracker's covariance may raise the residuals.
 _MAX_ROTATION_SIGMA, _MAX_MISFIT = 0.15, 9.0
@@ -95,22 +95,24 @@ class FusionState:
 
     Attributes:
         model: the sensor's world and mount.
-        drift: (6,) of the tracker.
-        calibration: (15,) errors of the tracker's calibration, in their standard deviations.
-        frame_error: (6,) error of the last frame alone, beside the drift.
+        error: (39,) means of the error states; zero of the sensor's world and mount, which are in the model.
         covariance: (39, 39) of all error states.
     """
 
     model: SensorModel
-    drift: np.ndarray
-    calibration: np.ndarray
-    frame_error: np.ndarray
+    error: np.ndarray
     covariance: np.ndarray
 
     @property
     def rotation_sigma(self) -> float:
         """Largest standard deviation of the rotation between the worlds, radians."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[9:12, 9:12])[-1], 0.0)))
+
+    def renewed(self, part: slice, covariance: np.ndarray) -> FusionState:
+        """With a part of the errors anew, of that covariance and independent of the others."""
+        error = self.error.copy()
+        error[part] = 0.0
+        return replace(self, error=error, covariance=renew_part(self.covariance, part, covariance))
 
 
 def find_worlds(
@@ -174,7 +176,7 @@ def _rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _solve(
     readings: PosedReadings, drift: np.ndarray, start: SensorModel, prior: np.ndarray
 ) -> tuple[FusionState, float]:
-    """Posterior of the tracker's drift now, its calibration, A and B, and the misfit, the sum of squared whitened residuals."""
+    """Posterior of the tracker's drift, calibration, A and B, and the misfit, the sum of squared whitened residuals."""
     count, width = readings.covariances.shape[:2]
     # The drift is a random walk: the covariance of two drifts is that of the earlier one.
     shared = readings.drift[np.minimum(np.arange(count)[:, None], np.arange(count)[None])]
@@ -185,7 +187,7 @@ def _solve(
         model = start.corrected(np.concatenate([np.zeros(6), worlds]))
         residual = _residuals_without_drift(model, readings)
         jacobian = reading_jacobian(model, readings.poses, readings.positions, readings.rotations)
-        by_drift, by_worlds = jacobian[..., DRIFT], jacobian[..., _WORLDS].reshape(count * width, -1)
+        by_drift, by_worlds = jacobian[..., DRIFT], jacobian[..., WORLDS].reshape(count * width, -1)
         noise = (by_drift[:, None] @ shared @ by_drift.swapaxes(1, 2)[None]).swapaxes(1, 2)
         of_frames = project_covariance(by_drift, readings.frame_error)
         noise[np.arange(count), :, np.arange(count), :] += readings.covariances + of_frames
@@ -197,19 +199,21 @@ def _solve(
         if np.abs(worlds - before).max() < _CONVERGED:
             break
     with_drift = np.einsum("ibc,iac->bia", readings.drift, by_drift).reshape(6, -1)
-    with_calibration = np.einsum("ibc,iab->cia", by_calibration, by_drift).reshape(CALIBRATION_SIZE, -1)
+    with_calibration = (by_drift @ by_calibration).reshape(-1, CALIBRATION_SIZE).T
     cross = np.concatenate([with_drift, prior @ by_worlds.T, with_calibration])
     gain = np.linalg.solve(S, cross.T).T
     covariance = np.zeros((STATE_SIZE, STATE_SIZE))
-    covariance[DRIFT, DRIFT], covariance[_WORLDS, _WORLDS] = drift, prior
+    covariance[DRIFT, DRIFT], covariance[WORLDS, WORLDS] = drift, prior
     covariance[CALIBRATION, CALIBRATION] = np.eye(CALIBRATION_SIZE)
     covariance[_SOLVED, _SOLVED] -= gain @ cross.T
     model = start.corrected(np.concatenate([np.zeros(6), worlds]))
     residual = _residuals_without_drift(model, readings)
     misfit = float(residual.ravel() @ np.linalg.solve(noise, residual.ravel()))
     covariance = 0.5 * (covariance + covariance.T)
-    mean = gain @ residual_at_prior
-    return FusionState(model, mean[DRIFT], mean[CALIBRATION], np.zeros(6), covariance), misfit
+    error = np.zeros(STATE_SIZE)
+    error[_SOLVED] = gain @ residual_at_prior
+    error[WORLDS] = 0.0
+    return FusionState(model, error, covariance), misfit
 
 
 def _residuals_without_drift(model: SensorModel, readings: PosedReadings) -> np.ndarray:
