@@ -77,23 +77,6 @@ class _Belief:
     drift_covariance: np.ndarray
 
 
-@dataclass(frozen=True, slots=True)
-class _TrackedPose:
-    """The tracker's pose at the time of a reading.
-
-    Attributes:
-        pose: (4, 4) between the last two frames.
-        share: of the time from the earlier frame to the last one, in [0, 1].
-        frame_covariance: (6, 6) of the error of a frame alone, perturbed from the left in the world.
-        by_calibration: (6, 15) how errors of the calibration enter its error, perturbed likewise.
-    """
-
-    pose: np.ndarray
-    share: float
-    frame_covariance: np.ndarray
-    by_calibration: np.ndarray
-
-
 class LocationFilter:
     """Improves the tracker's estimates frame by frame with the readings until then.
 
@@ -177,9 +160,10 @@ class LocationFilter:
             step = se3_log(se3_inverse(before.T_world_camera) @ estimate.T_world_camera)
             pose = before.T_world_camera @ se3_exp(share * step)
             by_calibration = (1.0 - share) * _world_by_calibration(before) + share * _world_by_calibration(estimate)
-            self._fuse_reading(
-                row, _TrackedPose(pose, share, frame_covariance, by_calibration), float(estimate.timestamp)
-            )
+            frame_error = (share**2 + (1.0 - share) ** 2) * frame_covariance
+            errors = np.array([self._belief.drift_covariance]), frame_error[None], by_calibration[None]
+            reading = PosedReadings(pose[None], *errors, *self._readings.row(row))
+            self._fuse_reading(reading, share, frame_covariance, float(estimate.timestamp))
         self._grow_drift((1.0 - done) * growth)
         if tracked:
             self._belief_when_tracked = self._belief
@@ -253,22 +237,27 @@ class LocationFilter:
         begin, self._next = self._next, int(np.searchsorted(self._readings.timestamps, until, side="right"))
         return range(begin, self._next)
 
-    def _fuse_reading(self, row: int, tracked: _TrackedPose, timestamp: float) -> None:
-        """Updates the state by a reading, or solves for the worlds while their rotation is not linear."""
+    def _fuse_reading(
+        self, reading: PosedReadings, share: float, frame_covariance: np.ndarray, timestamp: float
+    ) -> None:
+        """Updates the state by a reading, or solves for the worlds while their rotation is not linear.
+
+        Args:
+            reading: one.
+            share: its time's, of that from the frame before to this one, in [0, 1].
+            frame_covariance: (6, 6) of the error of a frame alone, perturbed from the left in the world.
+            timestamp: of the frame.
+        """
         self.summary.used += 1
         if self._belief.state is not None and not self._unsolved:
-            self._update(self._belief.state, row, tracked)
+            self._update(self._belief.state, reading, share, frame_covariance)
             return
-        share, drift_covariance = tracked.share, self._belief.drift_covariance
-        frame_covariance = (share**2 + (1.0 - share) ** 2) * tracked.frame_covariance
-        errors = drift_covariance, frame_covariance, tracked.by_calibration
-        (position, rotation, noise), of_tracker = self._readings.row(row), (each[None] for each in (tracked.pose, *errors))
-        rotations = None if rotation is None else rotation[None]
-        self._unsolved.append(PosedReadings(*of_tracker, position[None], rotations, noise[None]))
+        self._unsolved.append(reading)
         model = None if self._belief.state is None else self._belief.state.model
-        state = find_worlds(PosedReadings.concatenate(self._unsolved), drift_covariance, self._on_object, model)
-        self._belief = _Belief(state, drift_covariance)
-        self._renew_frame_error(tracked.frame_covariance)
+        readings = PosedReadings.concatenate(self._unsolved)
+        state = find_worlds(readings, self._belief.drift_covariance, self._on_object, model)
+        self._belief = replace(self._belief, state=state)
+        self._renew_frame_error(frame_covariance)
         full = len(self._unsolved) >= _MAX_READINGS
         if state is not None:
             self.summary.ready = timestamp if self.summary.ready is None else self.summary.ready
@@ -277,21 +266,21 @@ class LocationFilter:
         elif full:
             self._unsolved = self._unsolved[::2]
 
-    def _update(self, state: FusionState, row: int, tracked: _TrackedPose) -> None:
+    def _update(self, state: FusionState, reading: PosedReadings, share: float, frame_covariance: np.ndarray) -> None:
         """Unscented update by a reading."""
-        (position, rotation, noise), pose, share = self._readings.row(row), tracked.pose, tracked.share
+        measured = reading.positions, reading.rotations
         root = np.sqrt(STATE_SIZE) * matrix_root(state.covariance)
         points = np.concatenate([root.T, -root.T])
         errors = points + state.error
-        errors[:, DRIFT] += share * errors[:, FRAME_ERROR] + errors[:, CALIBRATION] @ tracked.by_calibration.T
-        residual = residuals(state.model.expect(pose, errors), position, rotation)
+        errors[:, DRIFT] += share * errors[:, FRAME_ERROR] + errors[:, CALIBRATION] @ reading.by_calibration[0].T
+        residual = residuals(state.model.expect(reading.poses, errors), *measured)
         innovation = residual.mean(axis=0)
         deviation = (innovation - residual) / np.sqrt(len(points))
         cross = points.T @ deviation / np.sqrt(len(points))
-        by_drift = reading_jacobian(state.model, pose, position, rotation)[:, DRIFT]
+        by_drift = reading_jacobian(state.model, reading.poses, *measured)[0, :, DRIFT]
         predicted = deviation.T @ deviation
         # The error of the earlier frame is not a state: it counts as noise.
-        noise = noise + (1.0 - share) ** 2 * by_drift @ tracked.frame_covariance @ by_drift.T
+        noise = reading.covariances[0] + (1.0 - share) ** 2 * by_drift @ frame_covariance @ by_drift.T
         squared = float(innovation @ np.linalg.solve(predicted + noise, innovation))
         # A reading beyond the gate is weakened until it lies on the gate.
         gate = CHI_SQUARE_999[len(innovation)]

@@ -50,8 +50,9 @@ class Locations:
         return len(self.timestamps)
 
     def row(self, index: int) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Position, rotation and covariance of one reading."""
-        return self.positions[index], None if self.rotations is None else self.rotations[index], self.covariances[index]
+        """Positions, rotations and covariances of one reading."""
+        rotations = None if self.rotations is None else self.rotations[[index]]
+        return self.positions[[index]], rotations, self.covariances[[index]]
 
 
 def read_locations(path: Path) -> Locations:
