@@ -242,11 +242,7 @@ class LocationFilter:
     ) -> None:
         """Updates the state by a reading, or solves for the worlds while their rotation is not linear.
 
-        Args:
-            reading: one.
-            share: its time's, of that from the frame before to this one, in [0, 1].
-            frame_covariance: (6, 6) of the error of a frame alone, perturbed from the left in the world.
-            timestamp: of the frame.
+        It was made after this share of the time from the frame before to this one.
         """
         self.summary.used += 1
         if self._belief.state is not None and not self._unsolved:

@@ -139,15 +139,11 @@ def find_worlds(
         return None
     mount_angle = 0.0 if readings.rotations is None else np.pi
     prior = np.diag(np.repeat([10.0 * (reading_extent + _MOUNT_SIGMA), np.pi, _MOUNT_SIGMA, mount_angle], 3) ** 2)
-    best, min_misfit = None, np.inf
-    for A, B in _guesses(readings, G) if start is None else [(start.A, start.B)]:
-        state, misfit = _solve(readings, drift, SensorModel(A, B, on_object), prior)
-        if misfit < min_misfit:
-            best, min_misfit = state, misfit
+    guesses = _guesses(readings, G) if start is None else [(start.A, start.B)]
+    solutions = [_solve(readings, drift, SensorModel(A, B, on_object), prior) for A, B in guesses]
+    best, misfit = min(solutions, key=lambda solution: solution[1])
     components = readings.covariances.shape[0] * readings.covariances.shape[1]
-    if best is None or min_misfit > _MAX_MISFIT * components:
-        return None
-    return best if best.rotation_sigma < _MAX_ROTATION_SIGMA else None
+    return best if misfit <= _MAX_MISFIT * components and best.rotation_sigma < _MAX_ROTATION_SIGMA else None
 
 
 def _guesses(readings: PosedReadings, G: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

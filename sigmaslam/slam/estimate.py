@@ -50,9 +50,8 @@ class Estimate:
             in the frame that defines the world, infinite variances before it.
         matching_covariance: (6, 6) the part of the covariance that comes from matches and motion; the rest comes from
             errors of the calibration.
-        by_calibration: (6, 15) how errors of the calibration, of variance one and in the order of
-            `sigmaslam.estimation.calibration_errors.ERRORS`, enter the pose's error in the camera's own frame: what
-            `covariance` has beyond `matching_covariance`. The errors are the same in all frames.
+        by_calibration: (6, 15) how constant errors of the calibration, of variance one, enter the pose's error in the
+            camera's own frame: what `covariance` has beyond `matching_covariance`.
         status: "starting"; "tracking"; "doubtful": tracked, but `doubts` speak against the pose, and the covariance
             holds what they may make of it; "ambiguous": likewise, and another pose explains the image about as well;
             "lost"; "inertial" or "odometry": lost by images, and predicted by that sensor; "skipped": one of the images
