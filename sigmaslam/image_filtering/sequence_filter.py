@@ -1,5 +1,7 @@
 """A Kalman filter for every pixel of a sequence, whose state moves along with what the pixel shows."""
 
+from collections.abc import Iterable, Iterator
+
 import cv2
 import numpy as np
 
@@ -14,6 +16,10 @@ _FLOW_SIGMA = 0.3
 _WINDOWS = (5, 11)
 # Sigmas up to which a window's statistic is chance.
 _GATE = 1.5
+# Frames that are filtered backwards at once, and later ones from which that begins: a state has settled after four.
+_AT_ONCE, _LATER = 8, 4
+# Variance of what nothing is known of, grey levels squared.
+_UNKNOWN = np.float32(1e6)
 
 
 class SequenceFilter:
@@ -26,7 +32,12 @@ class SequenceFilter:
 
     Args:
         noise: of the images; None to estimate it from the first one.
+
+    Attributes:
+        prior: mean and variance (H, W) of the state before the last frame was taken in.
     """
+
+    prior: tuple[np.ndarray, np.ndarray]
 
     def __init__(self, noise: NoiseModel | None = None) -> None:
         self.noise = noise
@@ -68,16 +79,20 @@ class SequenceFilter:
         # A pixel that is stuck measures nothing; its neighbours, less than they would.
         noise = np.where(stuck, np.float32(255.0**2), noise)
         if self._mean is None:
+            self.prior = measured, np.full_like(measured, _UNKNOWN)
             self._mean, self._variance = measured, noise
         else:
-            prior, variance = self._predict(measured, noise)
-            gain = variance / (variance + noise)
-            self._mean = prior + gain * (measured - prior)
-            self._variance = gain * noise
+            self.prior = self._predict(measured, noise)
+            self._mean, self._variance = _combine(*self.prior, measured, noise)
+        self._shown = self.show(self._mean, self._variance)
+        return self._shown
+
+    def show(self, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """(H, W) float32, a state without the noise that its variance tells of."""
+        assert self.noise is not None
         # What is stuck was filled in from neighbours: it is no worse than they are.
-        left_over = np.minimum(self._variance, self.noise.variance(self._mean) + np.float32(1e-3))
-        self._shown = np.clip(filter_patches(self._mean, left_over), 0.0, 255.0)
-        return np.asarray(self._shown)
+        left_over = np.minimum(variance, self.noise.variance(mean) + np.float32(1e-3))
+        return np.asarray(np.clip(filter_patches(mean, left_over), 0.0, 255.0))
 
     def _predict(self, measured: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance of the pixels' state before this frame is taken in."""
@@ -93,7 +108,7 @@ class SequenceFilter:
         variance = variance + _excess(measured - mean, variance + noise, noise)
         height, width = measured.shape
         outside = (map_x < 0) | (map_y < 0) | (map_x > width - 1) | (map_y > height - 1)
-        variance = np.where(outside, np.float32(1e6), variance)
+        variance = np.where(outside, _UNKNOWN, variance)
         return mean, variance
 
     def _correspondence(self, now: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -106,6 +121,40 @@ class SequenceFilter:
         flow = self._flow.calc(stretched[0], stretched[1], np.zeros((height, width, 2), np.float32))
         columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         return columns + flow[..., 0], rows + flow[..., 1]
+
+
+def filter_both_ways(images: Iterable[np.ndarray], forward: SequenceFilter) -> Iterator[np.ndarray]:
+    """Estimates (H, W) of all frames from those before and those after them, up to twelve frames late.
+
+    Args:
+        images: in their order, as `SequenceFilter.step` takes them, whose errors it raises.
+        forward: a new filter.
+    """
+    passed: list[tuple[np.ndarray, ...]] = []
+    for image in images:
+        forward.step(image)
+        passed.append((image, *forward.state))
+        if len(passed) == _AT_ONCE + _LATER:
+            yield from _with_later(passed, forward)[:_AT_ONCE]
+            del passed[:_AT_ONCE]
+    yield from _with_later(passed, forward)
+
+
+def _with_later(passed: list[tuple[np.ndarray, ...]], forward: SequenceFilter) -> list[np.ndarray]:
+    """Estimates of frames, images with mean and variance by those before."""
+    backward, estimates = SequenceFilter(forward.noise), []
+    for image, mean, variance in reversed(passed):
+        backward.step(image)
+        estimates.append(backward.show(*_combine(mean, variance, *backward.prior)))
+    return estimates[::-1]
+
+
+def _combine(
+    mean: np.ndarray, variance: np.ndarray, other: np.ndarray, other_variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance (H, W) of what two independent sources say."""
+    gain = variance / (variance + other_variance)
+    return mean + gain * (other - mean), gain * other_variance
 
 
 def _excess(innovation: np.ndarray, expected: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.files import atomic_write_bytes, check_new_folder, make_folder
-from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
+from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise, filter_both_ways
 from sigmaslam.progress import counted
 from sigmaslam.readers import StereoFrame
 from sigmaslam.readers.images import IMAGE_SUFFIXES, read_grey
@@ -28,7 +28,7 @@ class DenoiseSummary:
     Attributes:
         images: how many were written.
         noise: of the first image.
-        seconds: in the filters, reading and writing left out.
+        seconds: all together.
     """
 
     images: int
@@ -92,21 +92,11 @@ def denoise_files(
     check_new_folder(out)
     make_folder(out)
     alone = single or thorough or blur > 0.0 or _is_image(source)
-    follow = SequenceFilter(noise)
-    used: NoiseModel | None = noise
-    count, seconds = 0, 0.0
+    count, began, used = 0, time.perf_counter(), noise
+    results = _filter_alone(source, noise, thorough, blur) if alone else _filter_sequence(source, noise)
     with counted("images", None) as done:
-        for name, image in _read(source):
-            began = time.perf_counter()
-            if alone:
-                _check_size(image, name)
-                own = replace(noise or estimate_noise(image), blur=blur)
-                used = own if used is noise else used
-                result = denoise_image(image, own, thorough)
-            else:
-                result = _filter_next(follow, image, name)
-                used = follow.noise
-            seconds += time.perf_counter() - began
+        for name, own, result in results:
+            used = own if count == 0 else used
             path = out / f"{Path(name).stem}.png"
             if path.exists():
                 raise InputError(f"{source}: {name} and another image would both become {path.name}: rename one")
@@ -115,7 +105,35 @@ def denoise_files(
             done()
     if used is None:
         raise InputError(f"{source}: no image; give an image, a folder that holds some, or a video")
-    return DenoiseSummary(count, used, seconds)
+    return DenoiseSummary(count, used, time.perf_counter() - began)
+
+
+_Results = Iterator[tuple[str, NoiseModel | None, np.ndarray]]
+
+
+def _filter_alone(source: Path, noise: NoiseModel | None, thorough: bool, blur: float) -> _Results:
+    """Names, noise and estimates."""
+    for name, image in _read(source):
+        _check_size(image, name)
+        own = replace(noise or estimate_noise(image), blur=blur)
+        yield name, own, denoise_image(image, own, thorough)
+
+
+def _filter_sequence(source: Path, noise: NoiseModel | None) -> _Results:
+    """Likewise, each from those before and after it."""
+    names, forward = [], SequenceFilter(noise)
+
+    def images() -> Iterator[np.ndarray]:
+        for name, image in _read(source):
+            _check_size(image, name)
+            names.append(name)
+            yield image
+
+    try:
+        for number, result in enumerate(filter_both_ways(images(), forward)):
+            yield names[number], forward.noise, result
+    except ValueError as error:
+        raise FrameError(f"{names[-1]}: {error}; filter images of different sizes with --single") from None
 
 
 def _read(source: Path) -> Iterator[tuple[str, np.ndarray]]:

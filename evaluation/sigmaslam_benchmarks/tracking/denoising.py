@@ -13,7 +13,7 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_path, make_folder
-from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise
+from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise, filter_both_ways
 from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import list_images
 from sigmaslam.runs.denoise import to_bytes
@@ -35,7 +35,7 @@ NIGHTS = {
 }
 """Sensors before which a rendered sequence is shown again."""
 _REAL = ("kitti_raw_0926_0039_a", "euroc_mh01_f000_099")
-_SEQUENCE_FRAMES, _FIRST = 12, 4
+_SEQUENCE_FRAMES, _FIRST, _AFTER = 16, 4, 4
 
 Filter = Callable[[np.ndarray, NoiseModel], np.ndarray]
 Spoil = Callable[[np.ndarray, np.random.Generator], np.ndarray]
@@ -69,7 +69,7 @@ def write_denoising(
         "sigmas": [f"{sigma:.0f}" for sigma in SIGMAS],
         "filters": [name for name in _FILTERS if "thorough" not in name],
         "first": _FIRST,
-        "last": _SEQUENCE_FRAMES - 1,
+        "last": _SEQUENCE_FRAMES - _AFTER - 1,
         "frames": RECIPES[0].frames,
     }
     page, threads = "", cv2.getNumThreads()
@@ -177,17 +177,17 @@ def _sequences(data: Path, sources: dict[str, Path]) -> Iterator[list[str]]:
     chosen = {**sources, **{name: data / name for name in _REAL}}
     for name, source in chosen.items():
         rng, noise = np.random.default_rng(0), NoiseModel(25.0)
-        follow, found, seconds = SequenceFilter(noise), [], 0.0
-        for truth in _left_images(source):
-            image = truth + rng.normal(0.0, 25.0, truth.shape)
-            began = time.process_time()
-            result = follow.step(image)
-            seconds += time.process_time() - began
-            state, _ = follow.state
-            found.append([psnr(each, truth) for each in (image, denoise_image(image, noise), state, result)])
-        mean = np.mean(found[_FIRST:], axis=0)
-        cells = [f"{each:.2f}" for each in (*mean, mean[3] - mean[0])]
-        yield [name, *cells, f"{seconds / len(found):.3f}"]
+        truths = list(_left_images(source))
+        images = [truth + rng.normal(0.0, 25.0, truth.shape) for truth in truths]
+        forward = SequenceFilter(noise)
+        alone, before = [denoise_image(image, noise) for image in images], [forward.step(image) for image in images]
+        began = time.process_time()
+        both = list(filter_both_ways(images, SequenceFilter(noise)))
+        seconds = time.process_time() - began
+        rows = list(zip(truths, images, alone, before, both, strict=True))[_FIRST:-_AFTER]
+        mean = np.mean([[psnr(each, truth) for each in others] for truth, *others in rows], axis=0)
+        cells = [f"{each:.2f}" for each in (*mean, mean[3] - mean[1])]
+        yield [name, *cells, f"{seconds / len(images):.3f}"]
 
 
 def draw_sequences(path: Path, sources: list[Path]) -> None:
@@ -195,10 +195,9 @@ def draw_sequences(path: Path, sources: list[Path]) -> None:
     rows = []
     for source in sources:
         rng, noise = np.random.default_rng(0), NoiseModel(25.0)
-        follow = SequenceFilter(noise)
-        for truth in _left_images(source):
-            image = truth + rng.normal(0.0, 25.0, truth.shape)
-            result = follow.step(image)
+        truths = list(_left_images(source))
+        images = [truth + rng.normal(0.0, 25.0, truth.shape) for truth in truths]
+        image, result = images[-_AFTER], list(filter_both_ways(images, SequenceFilter(noise)))[-_AFTER]
         top, left = (image.shape[0] - 200) // 2, (image.shape[1] - 300) // 2
         part = slice(top, top + 200), slice(left, left + 300)
         rows.append(np.hstack([to_bytes(each[part]) for each in (image, denoise_image(image, noise), result)]))

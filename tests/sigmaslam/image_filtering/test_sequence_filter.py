@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.image_filtering import NoiseModel, SequenceFilter
+from sigmaslam.image_filtering import NoiseModel, SequenceFilter, filter_both_ways
 from sigmaslam.image_filtering.sequence_filter import _excess
 
 SIGMA = 20.0
@@ -88,3 +88,23 @@ def test_another_size_and_a_state_before_the_first_frame_are_refused(scene: np.n
     follow.step(scene)
     with pytest.raises(ValueError, match="240, 159"):
         follow.step(scene[:-1])
+
+
+def test_frames_before_and_after_leave_no_ghost_and_tell_more(scene: np.ndarray):
+    """Of 20 frames, more than are filtered at once, the first ten and the last two are covered."""
+    rng, covered = np.random.default_rng(0), scene.copy()
+    covered[60:100, 90:150] = 230.0
+    truths = [scene if 10 <= k < 18 else covered for k in range(20)]
+    images = [noisy(truth, rng) for truth in truths]
+    before = SequenceFilter(NoiseModel(SIGMA))
+    alone = [before.step(image) for image in images]
+    both = list(filter_both_ways(images, SequenceFilter(NoiseModel(SIGMA))))
+    assert len(both) == 20
+    inside = (slice(64, 96), slice(94, 146))
+    for k in (9, 10, 17, 18):
+        single = SequenceFilter(NoiseModel(SIGMA)).step(images[k])
+        assert abs(float((both[k] - truths[k])[inside].mean())) < 3.0
+        assert np.sqrt(np.mean((both[k] - truths[k])[inside] ** 2)) < 1.3 * np.sqrt(
+            np.mean((single - truths[k])[inside] ** 2)
+        )
+    assert error(both[5], covered) < 0.95 * error(alone[5], covered)
