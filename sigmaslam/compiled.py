@@ -1,7 +1,5 @@
 """Modules that are compiled where a compiler was at hand, and have slower twins."""
 
-from __future__ import annotations
-
 import logging
 from functools import cache
 from importlib import import_module

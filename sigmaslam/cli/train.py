@@ -1,7 +1,5 @@
 """`sigmaslam train`: networks trained and exported, and the renders that they learn from."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Which axes an accelerometer has: the signed permutation with which its samples give the path that cameras saw."""
 
-from __future__ import annotations
-
 from itertools import permutations, product
 
 import numpy as np

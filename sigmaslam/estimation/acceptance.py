@@ -1,7 +1,5 @@
 """The rules of acceptance: what lets a pose be said. `docs/acceptance.csv` says where each acts and who measured it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """The motion model of a tracker, by the sensor that it has."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.constant_velocity import MotionFilter

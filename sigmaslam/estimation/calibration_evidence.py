@@ -19,8 +19,6 @@ deviations may be larger, beside the hypotheses, the one of the largest marginal
 "type 2 maximum likelihood": Bishop 2006, section 3.5). Where the usual ones suffice it is one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """By how much errors that neighbours have in common spoil a pose: a cluster-robust covariance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Constant velocity: pose since the last keyframe and twist, the chapter's twelve states (9.37) on SE(3)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimator's equations: the torch modules of `sigmaslam_models.estimator`, compiled or exported as graphs."""
 
-from __future__ import annotations
-
 from typing import cast
 
 import numpy as np

@@ -1,7 +1,5 @@
 """When frames were taken: time stamps are an observation of a clock, and their noise is in their intervals."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from statistics import median

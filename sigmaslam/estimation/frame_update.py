@@ -5,8 +5,6 @@ the velocity: nothing of it can be counted twice. The equations are `sigmaslam_m
 runs as graphs; here is what decides.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.clustered_errors import clustering

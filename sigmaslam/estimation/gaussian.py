@@ -1,7 +1,5 @@
 """Gaussians of a state as arrays: square roots, regression, and parts that are copied."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

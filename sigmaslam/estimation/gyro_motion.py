@@ -1,7 +1,5 @@
 """Motion by a gyro alone: it turns as measured, and moves on at constant velocity."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.odometry_motion import OdometryMotion

@@ -4,8 +4,6 @@ T. Qin, P. Li, S. Shen: VINS-Mono, IEEE Transactions on Robotics 34(4), 2018, se
 the same equations hold.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

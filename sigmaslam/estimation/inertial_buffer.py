@@ -1,7 +1,5 @@
 """Inertial samples between images as relative motions, and what their noise turns out to be."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.gaussian import regression

@@ -1,7 +1,5 @@
 """Motion by an inertial sensor: pose since the keyframe, velocity, gravity, biases; before that constant velocity."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

@@ -6,8 +6,6 @@ and the Singular Value Decomposition, J. Astronautical Sciences 36(3), 1988), no
 the least residual is refined by Gauss and Newton together with the others.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

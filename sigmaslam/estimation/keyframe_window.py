@@ -10,8 +10,6 @@ Poses are perturbed from the left, in the world: views see relative poses alone,
 same vector everywhere, so that no linearisation point can leak information into what cannot be seen.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Squared Mahalanobis distance: the one formula behind gates, NEES and shares inside an ellipse."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

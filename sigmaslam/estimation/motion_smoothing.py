@@ -1,7 +1,5 @@
 """Fixed-interval smoothing of the constant-velocity chain: what later frames say of the motion to earlier ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

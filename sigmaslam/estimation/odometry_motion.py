@@ -1,7 +1,5 @@
 """Motion by wheels: the velocity changes as they measure, and images say what is wrong with it."""
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 

@@ -1,7 +1,5 @@
 """Whether a pose that images gave departs from its prediction by more than the motion allows, and why."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE

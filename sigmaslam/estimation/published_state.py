@@ -3,8 +3,6 @@
 Poses are estimated without: gates and weights that know of larger errors would move them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN

@@ -1,7 +1,5 @@
 """The last samples of a sensor of motion, as they come."""
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 

@@ -1,7 +1,5 @@
 """Whether a body is at rest, by images and inertial sensor, which must agree; and whether it was hit."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where calibration and poses stand in the error state of a window, and what a landmark's numbers are."""
 
-from __future__ import annotations
-
 # Errors of the calibration and of views, see `calibration_errors.ERRORS`. The measurement model knows the first ones;
 # the others enter linearly. The last ones enter views alone, not the places where landmarks are seen first.
 CALIBRATION_SIZE, CALIBRATION_MODELLED, VIEW_TURNS = 15, 3, 3

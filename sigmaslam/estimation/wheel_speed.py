@@ -1,7 +1,5 @@
 """The velocity that wheels measure, beside an inertial sensor that predicts it."""
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 

@@ -4,8 +4,6 @@ The classical Lucas-Kanade step (`refine`) takes both patches to differ by a shi
 scaled they do not; here each patch is first warped by the affine map that the neighbouring matches agree on.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

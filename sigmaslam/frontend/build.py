@@ -1,7 +1,5 @@
 """The front-ends by name."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from sigmaslam.errors import InputError

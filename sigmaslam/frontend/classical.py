@@ -1,7 +1,5 @@
 """SIFT and ORB as baselines and fall-backs, through the same interface as the learned features."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """Front-end for keypoints with descriptors, learned or classical: detect, match, refine, estimate confidence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

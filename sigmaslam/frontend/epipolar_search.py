@@ -1,7 +1,5 @@
 """Matches of two views that lie near each other's epipolar lines."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Selection of features at a minimum distance, as overlapping patches have correlated errors."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Patches of one image found in another one without features: from a start, else from where their neighbours went."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

@@ -1,7 +1,5 @@
 """How sharp images are."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

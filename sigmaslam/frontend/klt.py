@@ -1,7 +1,5 @@
 """Corners followed by pyramidal Lucas-Kanade, without descriptors."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Nearest points in the plane."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

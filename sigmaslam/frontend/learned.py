@@ -1,7 +1,5 @@
 """Our trained features: an ONNX graph, or the same network in torch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import cv2

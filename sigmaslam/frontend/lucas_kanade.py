@@ -1,7 +1,5 @@
 """Sub-pixel places by one Lucas-Kanade level, and the pyramidal tracker built on the same call."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

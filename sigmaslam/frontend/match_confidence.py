@@ -1,7 +1,5 @@
 """Probability and covariance of matches, from ONNX graphs or the same networks in torch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -5,8 +5,6 @@ began, and so do all others: they agree with each other and not with the truth. 
 they do not.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

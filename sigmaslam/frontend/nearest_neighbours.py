@@ -1,7 +1,5 @@
 """Nearest neighbours among unit descriptors, restricted to where geometry allows them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

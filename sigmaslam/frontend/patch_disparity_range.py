@@ -5,8 +5,6 @@ tell: the patch fits well, in the other eye and from everywhere. Neighbouring ke
 surfaces end; dense disparities do.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """What the patches of a match say of it: how well they agree, and how sharply that fixes the place."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ separable Gaussian, whose weights are tabulated by the fraction of a pixel: exac
 of the pixels would be off by up to 0.015 px, alike where all move alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from types import ModuleType

@@ -5,8 +5,6 @@ its near side. Lucas-Kanade over a shift takes the average of that for the keypo
 all views, and alike for all patches of one surface, so that many matches do not average them out.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

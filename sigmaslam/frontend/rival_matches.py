@@ -1,7 +1,5 @@
 """Matches that one pair of images cannot tell from others as good: of a scene that repeats itself, or upside down."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.frontend.types import Features

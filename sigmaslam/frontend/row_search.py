@@ -4,8 +4,6 @@ Edges are compared, those of large images at half the resolution, there and back
 alignment refines.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

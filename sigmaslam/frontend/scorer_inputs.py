@@ -1,7 +1,5 @@
 """Inputs of the match scorer: side information of putative matches, and their neighbours."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.frontend.knn import nearest_points

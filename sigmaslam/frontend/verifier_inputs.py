@@ -1,7 +1,5 @@
 """Inputs of the match verifier: columns that describe refined matches."""
 
-from __future__ import annotations
-
 from enum import Enum, auto
 
 import numpy as np

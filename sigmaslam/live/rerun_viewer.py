@@ -1,7 +1,5 @@
 """A run in Rerun: images with tracks, path, frusta, points, ellipsoids and plots, on the time of the recording."""
 
-from __future__ import annotations
-
 import logging
 import socket
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run as a web page while it goes on, read-only: picture, path, pose and verdict for those without a viewer."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

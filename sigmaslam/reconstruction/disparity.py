@@ -6,8 +6,6 @@ they leave of the difference, and how much texture it was found by, give the Cra
 is off by in truth was fitted on renders.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Disparities by a stereo network that the user names."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Which of thousands of keyframes look most like a view, by one vector each."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

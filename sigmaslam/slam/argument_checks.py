@@ -1,7 +1,5 @@
 """Arguments of the trackers, checked in constant time before anything is computed with them."""
 
-from __future__ import annotations
-
 import math
 from numbers import Real
 from typing import Any

@@ -1,7 +1,5 @@
 """Settings of the tracker."""
 
-from __future__ import annotations
-
 from dataclasses import Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Values that are made when they are asked for, or beside other work."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Generic, TypeVar

@@ -1,7 +1,5 @@
 """What speaks against a pose that images gave, and by how much it may be off."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 

@@ -1,7 +1,5 @@
 """One stereo pair on its way through the tracker."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Executor
 

@@ -1,7 +1,5 @@
 """Thousands of keyframes beside the few whose poses are remembered together: each hangs at one of these."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe

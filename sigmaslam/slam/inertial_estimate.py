@@ -1,7 +1,5 @@
 """What an inertial sensor says beside the pose: which way is up, and its biases."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

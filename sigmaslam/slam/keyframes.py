@@ -1,7 +1,5 @@
 """The keyframes of the window, and those that left it."""
 
-from __future__ import annotations
-
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which features may become landmarks: all of a static scene, or those of one body."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Landmarks followed from frame to frame, without features of the frame."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import cv2

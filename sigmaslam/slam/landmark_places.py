@@ -1,7 +1,5 @@
 """Where landmarks of a window should be seen."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.estimation.keyframe_window import KeyframeWindow

@@ -1,7 +1,5 @@
 """Keyframes in a map file, by which a later run finds its place."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Two maps of one place become one: keyframes of the second are found in the first, and all hang there."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """New keyframes and landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

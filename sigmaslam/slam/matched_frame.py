@@ -1,7 +1,5 @@
 """A frame with the landmarks that were found in it, for pictures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far matched places and disparities are believed, and how the innovations correct that."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.frontend import StereoView, TemporalMatches

@@ -1,7 +1,5 @@
 """Where in the image something moves on its own, carried on from frame to frame."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.frontend.knn import nearest_points

@@ -1,7 +1,5 @@
 """What a tracker has come to know so far."""
 
-from __future__ import annotations
-
 from enum import Enum, auto
 from math import inf
 

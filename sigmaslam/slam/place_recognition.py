@@ -1,7 +1,5 @@
 """Which keyframes show the place that a view shows."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sigmaslam.frontend import StereoView

@@ -1,7 +1,5 @@
 """Tracking begins, begins again, or goes on from a view whose velocity is unknown."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 

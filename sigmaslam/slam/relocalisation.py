@@ -1,7 +1,5 @@
 """Relocalisation: a lost view is found in the last keyframe, among those that left the window, or in a map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Estimates in the user's camera, from what the filter knows of the rectified one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

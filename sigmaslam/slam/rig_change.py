@@ -1,7 +1,5 @@
 """Whether the right camera was bumped: it sees the landmarks elsewhere than before, all by the same."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

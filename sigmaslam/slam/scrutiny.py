@@ -1,7 +1,5 @@
 """Looks at a pose that images gave for what speaks against it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

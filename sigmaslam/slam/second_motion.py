@@ -1,7 +1,5 @@
 """Whether the matches that disagree with a pose agree with another one: something else moves, or the image is torn."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A clock that was set, or frames that are missing: a long interval alone does not tell."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

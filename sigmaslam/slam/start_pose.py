@@ -1,7 +1,5 @@
 """Where a tracker starts that goes on in the world of an earlier run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Wall time of the stages of a frame."""
 
-from __future__ import annotations
-
 import time
 
 

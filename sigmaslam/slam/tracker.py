@@ -1,7 +1,5 @@
 """The tracker: one stereo pair in, one pose with covariance out."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path

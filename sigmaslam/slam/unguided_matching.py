@@ -1,7 +1,5 @@
 """The pose of a view relative to a keyframe from their features alone, without a prediction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
