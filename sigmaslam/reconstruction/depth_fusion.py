@@ -44,7 +44,8 @@ _OUTSIDE = np.float32(-1e4)
 _BY_STEP = np.zeros((3, 4, 6))
 _BY_STEP[range(3), 0, range(3)] = 1.0
 _BY_STEP[(0, 1, 1, 0, 2, 2), (1, 1, 2, 3, 3, 2), (4, 3, 5, 5, 3, 4)] = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
-# Confirmations that a point needs where there are so many other views.
+# Confirmations that a point needs of the views that see its place, and of the nearer ones among them, where there are
+# so many: what is wrong by far is seldom seen again from nearer, where a pixel is a smaller piece.
 _MIN_SUPPORT = 2
 
 
@@ -82,20 +83,19 @@ class FusedDepth:
         support: (H, W) uint8 other keyframes that confirm it.
         contradictions: (H, W) uint8 other keyframes that see something behind it, in its direction, or another
             texture in its place.
-        least_support: confirmations that a point needs.
+        is_seen_again: (H, W) bool, as many of those that see its place confirm it as should, and of the nearer ones.
     """
 
     disparity: np.ndarray
     variance: np.ndarray
     support: np.ndarray
     contradictions: np.ndarray
-    least_support: int = 1
+    is_seen_again: np.ndarray
 
     @property
     def is_confirmed(self) -> np.ndarray:
         """(H, W) bool: more keyframes confirm the point than contradict it. Where a body moved it is not."""
-        enough = (self.support >= self.least_support) & (self.support > self.contradictions)
-        return np.asarray(enough & (self.disparity > 0.0))
+        return np.asarray(self.is_seen_again & (self.support > self.contradictions) & (self.disparity > 0.0))
 
 
 def disparity_slope(disparity: np.ndarray) -> list[np.ndarray]:
@@ -143,14 +143,19 @@ def fuse_depth(
     mean = reference.disparity.ravel()[known]
     common = np.float32(shared) * reference.variance.ravel()[known]
     variance = np.float32(1.0 - shared) * reference.variance.ravel()[known]
-    support, contradictions = np.zeros((2, len(known)), np.uint8)
+    support, contradictions, visible, nearer, nearer_support = np.zeros((5, len(known)), np.uint8)
     cost = np.zeros_like(mean)
     texture = [each.ravel()[known] for each in _texture(image.astype(np.float32))]
     for view, pose, covariance in others:
         seen = _measure(view, pose, step_products(covariance), rays, mean, variance, camera)
         images = _compare(image, known, seen[0])
-        states = mean, variance, common, cost, support, contradictions
+        states, before = (mean, variance, common, cost, support, contradictions), support
+        is_visible = np.isfinite(seen[1])
+        # Depth there over depth here.
+        is_nearer = pose[2, :3].astype(np.float32) @ rays + np.float32(pose[2, 3] / camera.focal_baseline) * mean < 1.0
         mean, variance, cost, support, contradictions = _update(known, seen, *images, texture, shared, *states)
+        visible, nearer = visible + is_visible, nearer + (is_visible & is_nearer)
+        nearer_support = nearer_support + (support - before) * is_nearer
     # Where the views differ by more than they should, or less, variances are scaled: the mean of the posterior of a
     # scale that has an inverse gamma distribution. That they agree says nothing of what they have in common.
     scale = (_FREEDOM + cost) / (_FREEDOM + support)
@@ -160,7 +165,12 @@ def fuse_depth(
         _spread(fused, known, shape, np.nan),
         _spread(support, known, shape, 0),
         _spread(contradictions, known, shape, 0),
-        min(_MIN_SUPPORT, max(len(others), 1)),
+        _spread(
+            (support >= np.minimum(visible, _MIN_SUPPORT)) & (nearer_support >= np.minimum(nearer, _MIN_SUPPORT)),
+            known,
+            shape,
+            False,
+        ),
     )
 
 

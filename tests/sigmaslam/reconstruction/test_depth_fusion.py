@@ -78,6 +78,33 @@ def test_an_uncertain_pose_leaves_the_depth_of_the_view():
     assert np.median(fused.variance[seen]) > 0.6 * NOISE
 
 
+def fuse_beside(left: float, right: float, nearer: float, others: list[float]) -> FusedDepth:
+    """Of a view so much nearer (metres) that adds to the halves of its disparities, and exact ones likewise."""
+    image, true = plane(np.eye(4))
+    views = []
+    for k, forward in enumerate([nearer, *others]):
+        pose = np.eye(4)
+        pose[2, 3] = forward
+        seen, disparity = plane(pose)
+        if k == 0:
+            disparity[:, : CAMERA.width // 2] += left
+            disparity[:, CAMERA.width // 2 :] += right
+        views.append((DepthView.of(seen, measure(disparity, k + 1)), se3_inverse(pose), 1e-12 * np.eye(6)))
+    return fuse_depth(image, measure(true, 0), views, CAMERA, shared=0.0)
+
+
+@pytest.mark.parametrize(
+    ("nearer", "others"), [(-0.1, [-0.2]), (0.1, [-0.1, -0.2, -0.3])], ids=["of two views", "the nearer one"]
+)
+def test_views_that_see_the_place_confirm_it_and_one_that_does_not_is_not_asked(nearer: float, others: list[float]):
+    """In the right half something stands before it, which is no contradiction; in the left nothing is measured."""
+    fused = fuse_beside(np.nan, 3.0, nearer, others)
+    middle = CAMERA.width // 2
+    assert (fused.contradictions[8:-8, 8:-8] == 0).mean() > 0.9
+    assert fused.is_confirmed[10:-10, 10 : middle - 10].mean() > 0.85
+    assert fused.is_confirmed[10:-10, middle + 10 : -10].mean() < 0.05
+
+
 def test_what_has_moved_is_not_confirmed():
     fused, _ = fuse(distance_later=6.0)
     assert np.isfinite(fused.disparity).any()

@@ -137,7 +137,7 @@ def test_voxels_have_a_size_where_the_first_keyframe_has_no_points():
     camera = RectifiedStereo(400.0, 400.0, 30.0, 20.0, 0.1, 60, 40)
     shape, nothing = (40, 60), np.full((40, 60), np.nan, np.float32)
     single = DisparityMap(np.full(shape, 8.0, np.float32), np.ones(shape, np.float32))
-    fused = FusedDepth(nothing, nothing, *np.zeros((2, *shape), np.uint8))
+    fused = FusedDepth(nothing, nothing, *np.zeros((2, *shape), np.uint8), np.zeros(shape, bool))
     depth = KeyframeDepth(0, np.zeros(shape, np.uint8), single, fused, np.eye(4), np.eye(6), 0.1)
     assert default_voxel(depth, camera) == pytest.approx(2 * 5.0 / 400.0, rel=0.02)
 
@@ -146,7 +146,7 @@ def test_points_at_borders_of_what_is_measured_are_left_out():
     shape, borders = (60, 80), np.zeros((60, 80), np.float32)
     borders[20:, 40:] = np.nan
     sure, support = np.where(np.isnan(borders), np.nan, 1e-4).astype(np.float32), np.full(shape, 3, np.uint8)
-    fused = FusedDepth(borders + 8.0, sure, support, np.zeros(shape, np.uint8))
+    fused = FusedDepth(borders + 8.0, sure, support, np.zeros(shape, np.uint8), support > 0)
     single = DisparityMap(fused.disparity, sure)
     depth = KeyframeDepth(0, np.zeros(shape, np.uint8), single, fused, np.eye(4), np.eye(6), 0.0)
     assert depth.is_point[8:-8, :36].all()
