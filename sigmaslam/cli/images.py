@@ -140,8 +140,8 @@ def denoise(
 ) -> None:
     """Filter Gaussian, shot and quantisation noise, stuck pixels and blur out of images; writes 8-bit grey PNG.
 
-    Images of a folder or a video are a sequence, which is filtered over time: what moves is followed, what changes
-    starts anew. The noise is estimated from the first image, or from each with --single.
+    Images of a folder or a video are a sequence, each filtered with those before and after it: what moves is
+    followed, what changes starts anew. The noise is estimated from the first image, or from each with --single.
     """
     from sigmaslam.image_filtering import NoiseModel
     from sigmaslam.runs.denoise import denoise_files
