@@ -156,6 +156,8 @@ def fuse_depth(
         mean, variance, cost, support, contradictions = _update(known, seen, *images, texture, shared, *states)
         visible, nearer = visible + is_visible, nearer + (is_visible & is_nearer)
         nearer_support = nearer_support + (support - before) * is_nearer
+    enough, enough_nearer = np.minimum([visible, nearer], _MIN_SUPPORT)
+    is_seen_again = (support >= enough) & (nearer_support >= enough_nearer)
     # Where the views differ by more than they should, or less, variances are scaled: the mean of the posterior of a
     # scale that has an inverse gamma distribution. That they agree says nothing of what they have in common.
     scale = (_FREEDOM + cost) / (_FREEDOM + support)
@@ -165,12 +167,7 @@ def fuse_depth(
         _spread(fused, known, shape, np.nan),
         _spread(support, known, shape, 0),
         _spread(contradictions, known, shape, 0),
-        _spread(
-            (support >= np.minimum(visible, _MIN_SUPPORT)) & (nearer_support >= np.minimum(nearer, _MIN_SUPPORT)),
-            known,
-            shape,
-            False,
-        ),
+        _spread(is_seen_again, known, shape, False),
     )
 
 

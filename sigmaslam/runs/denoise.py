@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -129,11 +130,9 @@ def _filter_sequence(source: Path, noise: NoiseModel | None) -> _Results:
             names.append(name)
             yield image
 
-    try:
+    with _naming(names):
         for number, result in enumerate(filter_both_ways(images(), forward)):
             yield names[number], forward.noise, result
-    except ValueError as error:
-        raise FrameError(f"{names[-1]}: {error}; filter images of different sizes with --single") from None
 
 
 def _read(source: Path) -> Iterator[tuple[str, np.ndarray]]:
@@ -154,10 +153,17 @@ def _is_image(source: Path) -> bool:
 
 def _filter_next(follow: SequenceFilter, image: np.ndarray, name: str) -> np.ndarray:
     _check_size(image, name)
-    try:
+    with _naming([name]):
         return follow.step(image)
+
+
+@contextmanager
+def _naming(names: list[str]) -> Iterator[None]:
+    """What a filter refuses is the last of these images."""
+    try:
+        yield
     except ValueError as error:
-        raise FrameError(f"{name}: {error}; filter images of different sizes with --single") from None
+        raise FrameError(f"{names[-1]}: {error}; filter images of different sizes with --single") from None
 
 
 def _check_size(image: np.ndarray, name: str) -> None:

@@ -176,9 +176,8 @@ def _sequences(data: Path, sources: dict[str, Path]) -> Iterator[list[str]]:
     """Rendered and real sequences, each image by itself and over time."""
     chosen = {**sources, **{name: data / name for name in _REAL}}
     for name, source in chosen.items():
-        rng, noise = np.random.default_rng(0), NoiseModel(25.0)
-        truths = list(_left_images(source))
-        images = [truth + rng.normal(0.0, 25.0, truth.shape) for truth in truths]
+        noise = NoiseModel(25.0)
+        truths, images = _noisy_images(source)
         forward = SequenceFilter(noise)
         alone, before = [denoise_image(image, noise) for image in images], [forward.step(image) for image in images]
         began = time.process_time()
@@ -194,15 +193,20 @@ def draw_sequences(path: Path, sources: list[Path]) -> None:
     """Writes a picture: for each sequence a part of its last frame noisy, filtered by itself, and over time."""
     rows = []
     for source in sources:
-        rng, noise = np.random.default_rng(0), NoiseModel(25.0)
-        truths = list(_left_images(source))
-        images = [truth + rng.normal(0.0, 25.0, truth.shape) for truth in truths]
-        image, result = images[-_AFTER], list(filter_both_ways(images, SequenceFilter(noise)))[-_AFTER]
+        noise, (_, images) = NoiseModel(25.0), _noisy_images(source)
+        last = len(images) - _AFTER - 1
+        image, result = images[last], list(filter_both_ways(images, SequenceFilter(noise)))[last]
         top, left = (image.shape[0] - 200) // 2, (image.shape[1] - 300) // 2
         part = slice(top, top + 200), slice(left, left + 300)
         rows.append(np.hstack([to_bytes(each[part]) for each in (image, denoise_image(image, noise), result)]))
     with atomic_path(path) as temporary:
         cv2.imwrite(str(temporary), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 80])
+
+
+def _noisy_images(source: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Left images, and the same with noise of sigma 25."""
+    rng, truths = np.random.default_rng(0), list(_left_images(source))
+    return truths, [truth + rng.normal(0.0, 25.0, truth.shape) for truth in truths]
 
 
 def _left_images(source: Path) -> Iterator[np.ndarray]:
