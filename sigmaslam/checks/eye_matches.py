@@ -1,9 +1,8 @@
 """Matches between the two eyes, searched in the whole image so that wrong rows and swapped eyes show."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -39,12 +38,12 @@ class EyeMatches(Table):
     pair: np.ndarray
 
     @classmethod
-    def empty(cls) -> EyeMatches:
+    def empty(cls) -> Self:
         """No matches."""
         places = np.zeros((0, 2))
         return cls(places, places, np.zeros((0, 2, 2)), np.zeros(0), places, np.zeros(0, int))
 
-    def unfollowed(self) -> EyeMatches:
+    def unfollowed(self) -> Self:
         """The same without motion."""
         return replace(self, flow=np.full_like(self.flow, np.nan))
 

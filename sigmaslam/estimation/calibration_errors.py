@@ -6,9 +6,8 @@ but what they do to every pose and map point is carried along, and is part of th
 Schmidt's filter, which trusts views less for them, every window makes up a calibration of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -73,7 +72,7 @@ class CalibrationPrior:
         """(15,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
-    def widened(self, sigma: np.ndarray) -> CalibrationPrior:
+    def widened(self, sigma: np.ndarray) -> Self:
         """The same with independent errors more, of standard deviations (15,)."""
         return replace(self, covariance=self.covariance + np.diag(sigma**2))
 
@@ -100,7 +99,7 @@ class CalibrationPrior:
         offset_sigma: float,
         estimate: tuple[str, ...] = (),
         covariance: CalibrationCovariance | None = None,
-    ) -> CalibrationPrior:
+    ) -> Self:
         """Of a rectified pair.
 
         Args:
@@ -127,7 +126,7 @@ class CalibrationPrior:
         return cls(joint, prior.estimated)
 
     @classmethod
-    def independent(cls, sigma: np.ndarray, *estimated: str) -> CalibrationPrior:
+    def independent(cls, sigma: np.ndarray, *estimated: str) -> Self:
         """Independent errors with standard deviations of the first of `ERRORS`, in which `estimated` are names."""
         variance = np.pad(np.square(sigma), (0, len(ERRORS) - len(sigma)))
         return cls(np.diag(variance), np.isin(ERRORS, estimated))

@@ -1,8 +1,7 @@
 """What a frame says of its pose, given the window."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -82,11 +81,11 @@ class FrameFit:
         """(4, 4) T_keyframe_camera since the last keyframe."""
         return np.asarray(se3_inverse(self.last) @ self.pose)
 
-    def spread_by(self, covariance: np.ndarray) -> FrameFit:
+    def spread_by(self, covariance: np.ndarray) -> Self:
         """The same pose, less certain by a covariance (6, 6) that matches do not know of."""
         return replace(self, relative=self.relative + covariance, covariance=self.covariance + covariance)
 
-    def inflated(self, factor: float) -> FrameFit:
+    def inflated(self, factor: float) -> Self:
         """The same pose, known so much less well relative to the last keyframe."""
         return replace(
             self,

@@ -4,9 +4,8 @@ C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza: On-Manifold Preintegration f
 IEEE Transactions on Robotics 33(1), 2017, eqs. (26) - (48); integrated by the midpoint rule.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -47,7 +46,7 @@ class Preintegrated:
     accel_noise: np.ndarray
     missing: float = 0.0
 
-    def corrected(self, change: np.ndarray) -> Preintegrated:
+    def corrected(self, change: np.ndarray) -> Self:
         """With the first that the slope is by changed by (n,), to the first order."""
         step = self.slope[:, : len(change)] @ change
         return replace(

@@ -4,9 +4,8 @@ Differences of perturbations from the left do not know where the world is. They 
 conditioned on a frame's views, which see nothing else: what poses have in common may be known a million times worse.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -89,7 +88,7 @@ class _Earlier:
     common: np.ndarray
 
     @classmethod
-    def of(cls, state: WindowState, index: np.ndarray) -> _Earlier:
+    def of(cls, state: WindowState, index: np.ndarray) -> Self:
         """Those of the past and of the window, in this order."""
         past, poses, own, cross, common = state.past, [], [], [], []
         for k in index:

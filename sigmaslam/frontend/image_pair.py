@@ -1,12 +1,11 @@
 """Two images in, matches with a probability and a covariance out: `sigmaslam images match`."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -70,7 +69,7 @@ class Matches(Table):
     index0: np.ndarray
     index1: np.ndarray
 
-    def by_probability(self) -> Matches:
+    def by_probability(self) -> Self:
         """The same, the most probable first."""
         return self.select(np.argsort(-self.probability, kind="stable"))
 

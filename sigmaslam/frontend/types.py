@@ -1,9 +1,7 @@
 """What passes between the front-end and the tracker."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -58,7 +56,7 @@ class StereoView:
     usable: np.ndarray | None = None
     is_blurred: bool = False
 
-    def within(self, usable: np.ndarray | None) -> StereoView:
+    def within(self, usable: np.ndarray | None) -> Self:
         """The view with the features of usable pixels (H, W) bool alone."""
         if usable is None:
             return self
@@ -71,7 +69,7 @@ class StereoView:
         """(K, 3) float64 (u, v, disparity) of the features of that index or mask."""
         return np.column_stack([self.features.keypoints[index].astype(np.float64), self.disparity[index]])
 
-    def only(self, chosen: np.ndarray) -> StereoView:
+    def only(self, chosen: np.ndarray) -> Self:
         """The view without the disparities of all but the chosen features (N,) bool."""
         return replace(self, disparity=np.where(chosen, self.disparity, np.nan))
 
@@ -125,11 +123,11 @@ class KeypointSearch:
     disparity: np.ndarray | None = None
 
     @classmethod
-    def anywhere(cls, key: StereoView, index: np.ndarray) -> KeypointSearch:
+    def anywhere(cls, key: StereoView, index: np.ndarray) -> Self:
         """Keypoints that may be anywhere in the view."""
         return cls(key, index, key.features.keypoints[index].astype(np.float64))
 
-    def widened(self, factor: float) -> KeypointSearch:
+    def widened(self, factor: float) -> Self:
         """The same search, of predictions with so many times the covariance."""
         return self if self.covariance is None else replace(self, covariance=factor * self.covariance)
 
@@ -159,7 +157,7 @@ class TemporalMatches(Table):
         """(M, 3) (u, v, disparity)."""
         return np.column_stack([self.points, self.disparity])
 
-    def within(self, usable: np.ndarray | None) -> TemporalMatches:
+    def within(self, usable: np.ndarray | None) -> Self:
         """Those at usable pixels (H, W) bool alone."""
         return self if usable is None else self.select(pixels_in(usable, self.points))
 

@@ -5,9 +5,8 @@ carrier of the sensor: the camera's pose in the tracker's world, or the pose T_c
 the mount, the pose of the sensor on its carrier.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -53,7 +52,7 @@ class SensorModel:
         G = se3_inverse(corrected) if self.on_object else corrected
         return np.asarray(self.A @ se3_exp(error[..., SENSOR_WORLD]) @ G @ self.B @ se3_exp(error[..., MOUNT]))
 
-    def corrected(self, error: np.ndarray) -> SensorModel:
+    def corrected(self, error: np.ndarray) -> Self:
         """The model with the errors (18,) of drift, A and B applied."""
         return replace(self, A=self.A @ se3_exp(error[SENSOR_WORLD]), B=self.B @ se3_exp(error[MOUNT]))
 
@@ -108,7 +107,7 @@ class FusionState:
         """Largest standard deviation of the rotation between the worlds, radians."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[9:12, 9:12])[-1], 0.0)))
 
-    def renewed(self, part: slice, covariance: np.ndarray) -> FusionState:
+    def renewed(self, part: slice, covariance: np.ndarray) -> Self:
         """With a part of the errors anew, of that covariance and independent of the others."""
         error = self.error.copy()
         error[part] = 0.0

@@ -1,11 +1,9 @@
 """Points with covariances: from depths of keyframes, merged in voxels, and as a PLY file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -95,7 +93,7 @@ class DepthPixels(Table):
     intensity: np.ndarray
 
     @classmethod
-    def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> DepthPixels:
+    def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> Self:
         """The chosen pixels, (H, W) bool, of such images (H, W); disparities there are positive."""
         values, variances = (each[chosen].astype(float) for each in (disparity, variance))
         return cls(np.argwhere(chosen)[:, ::-1], values, variances, image[chosen])
@@ -134,7 +132,7 @@ class DepthPixels(Table):
             np.ones(len(points), np.int32),
         )
 
-    def thinned(self, camera: RectifiedStereo, size: float) -> DepthPixels:
+    def thinned(self, camera: RectifiedStereo, size: float) -> Self:
         """The most certain pixel of each voxel of the camera's frame; those beside it have nearly the same errors."""
         if kernels is not None:
             pair = camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline

@@ -6,9 +6,8 @@ there and the one predicted, both of which depend on the state and on the pose b
 the scalar form of the Kalman filter in `sigmaslam_filters`, to which a test holds it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -64,7 +63,7 @@ class DepthView:
     sampled: np.ndarray
 
     @classmethod
-    def of(cls, image: np.ndarray, measured: DisparityMap) -> DepthView:
+    def of(cls, image: np.ndarray, measured: DisparityMap) -> Self:
         """The view of a keyframe with such an image (H, W) uint8 and disparities."""
         if kernels is not None:
             sampled = kernels.sample_view(measured.disparity, measured.variance)

@@ -1,11 +1,9 @@
 """Ctrl-C, SIGTERM and SIGHUP end a run once; while its results are written, further ones change nothing."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from types import FrameType
-from typing import Any
+from typing import Any, Self
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 
@@ -44,7 +42,7 @@ class StopSignals:
         self._held = False
         self._before: dict[signal.Signals, Any] = {}
 
-    def __enter__(self) -> StopSignals:
+    def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.Signals[name] for name in _NAMES if name in signal.Signals.__members__):
                 if signal.getsignal(number) != signal.SIG_IGN:

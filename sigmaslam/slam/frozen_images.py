@@ -1,7 +1,5 @@
 """Images that say nothing, delivered before, in whole or in part, or noise alone; and those of two moments."""
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import pairwise
 

@@ -1,10 +1,9 @@
 """Where the landmarks of a window are in a view, by a prediction of its pose."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from typing import Self
 
 import numpy as np
 
@@ -52,7 +51,7 @@ class GuidedMatches:
     rival: np.ndarray | None = None
 
     @classmethod
-    def empty(cls) -> GuidedMatches:
+    def empty(cls) -> Self:
         """No match, and no search."""
         return cls(LandmarkViews.empty(), np.zeros(0), np.zeros(0, np.int64))
 

@@ -1,8 +1,7 @@
 """One keyframe: what it saw, and what became of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -59,7 +58,7 @@ class Keyframe:
         if self.dense is not None:
             self.dense.get()
 
-    def leave_window(self, points: PointMap) -> Keyframe:
+    def leave_window(self, points: PointMap) -> Self:
         """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
         view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=(), usable=None)
         return replace(self, view=view, energies=np.zeros((0, 2)), dense=None, points=points)
@@ -103,7 +102,7 @@ class HangingKeyframe:
         """(N, D) of its features."""
         return self.packed.descriptors
 
-    def handed_over(self, heir: int, T_heir_origin: np.ndarray, covariance: np.ndarray) -> HangingKeyframe:
+    def handed_over(self, heir: int, T_heir_origin: np.ndarray, covariance: np.ndarray) -> Self:
         """The keyframe at another neighbour; covariance: (6, 6) of the step to it, perturbed from the left there."""
         pose = T_heir_origin @ self.step
         own = turn_covariance(T_heir_origin, self.covariance)

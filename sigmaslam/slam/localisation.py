@@ -1,8 +1,7 @@
 """The pose of a frame in the window: near the prediction first, then anywhere."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -40,7 +39,7 @@ class Prediction:
     covariance: np.ndarray
 
     @classmethod
-    def of(cls, window: KeyframeWindow, motion: MotionFilter) -> Prediction:
+    def of(cls, window: KeyframeWindow, motion: MotionFilter) -> Self:
         """The last keyframe of the window, moved on."""
         key = window.posterior.poses[-1]
         return cls(key @ motion.step, turn_covariance(key, motion.step_covariance))

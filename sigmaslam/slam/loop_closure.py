@@ -1,9 +1,8 @@
 """Loops: the newest keyframe sees a place that was left long ago."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -40,7 +39,7 @@ class _Contradiction:
     difference: np.ndarray
     covariance: np.ndarray
 
-    def agrees_with(self, earlier: _Contradiction, depth: float) -> bool:
+    def agrees_with(self, earlier: Self, depth: float) -> bool:
         """Whether both say the same (99.99 %), if odometry has been off since by as much as it may be."""
         apart = self.difference - earlier.difference
         since = _DRIFT * np.linalg.norm(self.pose[:3, 3] - earlier.pose[:3, 3])

@@ -1,8 +1,7 @@
 """A keyframe's view in a tenth of its memory: what finds it again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -31,7 +30,7 @@ class PackedView:
     disparity_sigma: np.ndarray
 
     @classmethod
-    def of(cls, view: StereoView, count: int | None = None) -> PackedView:
+    def of(cls, view: StereoView, count: int | None = None) -> Self:
         """A view with its best `count` features in stereo, or with all of them."""
         kept = np.flatnonzero(np.isfinite(view.disparity))[:count]
         features = view.features.select(kept)

@@ -1,8 +1,7 @@
 """The map: landmarks, refined by every keyframe that saw them again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -44,12 +43,12 @@ class PointMap(Table):
     intensity: np.ndarray
 
     @classmethod
-    def empty(cls) -> PointMap:
+    def empty(cls) -> Self:
         """No points."""
         flat = np.zeros(0)
         return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64), flat, np.zeros((0, 2)), _unknown(0))
 
-    def shade(self, image: np.ndarray, timestamp: float) -> PointMap:
+    def shade(self, image: np.ndarray, timestamp: float) -> Self:
         """The map with the grey values of the points that the keyframe of that time saw first.
 
         Args:
@@ -63,7 +62,7 @@ class PointMap(Table):
         intensity[rows] = image[v, u]
         return replace(self, intensity=intensity)
 
-    def transform(self, T: np.ndarray) -> PointMap:
+    def transform(self, T: np.ndarray) -> Self:
         """The map in another world, T (4, 4) takes this one there."""
         R = T[:3, :3]
         return replace(self, points=transform_points(T, self.points), covariances=R @ self.covariances @ R.T)

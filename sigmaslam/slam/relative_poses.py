@@ -5,9 +5,8 @@ since, are in it. What the tracker knows of the way from a keyframe to the frame
 between the two, which is forgotten when the next frame comes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -47,7 +46,7 @@ class RelativePoses(Table):
     covariance: np.ndarray
 
     @classmethod
-    def empty(cls) -> RelativePoses:
+    def empty(cls) -> Self:
         """No row."""
         return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 

@@ -1,8 +1,7 @@
 """Relative orientation of two views where much may be wrong or little known: many starts, one honest covariance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -273,7 +272,7 @@ class _Fit:
     covariance: np.ndarray
 
     @classmethod
-    def of(cls, rays: MatchedRays, probability: np.ndarray, R: np.ndarray, direction: np.ndarray) -> _Fit:
+    def of(cls, rays: MatchedRays, probability: np.ndarray, R: np.ndarray, direction: np.ndarray) -> Self:
         at = _at(rays, R, direction)
         near = soft_weight(at.squared)
         usual = at.usual(probability * near)

@@ -1,9 +1,8 @@
 """The pose relative to what stands still, where a large part of the matches may be on something that moves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -29,7 +28,7 @@ class _Motion:
     disparity: float
 
     @classmethod
-    def of(cls, pose: RelativePose, cells: np.ndarray, disparity: np.ndarray, probability: np.ndarray) -> _Motion:
+    def of(cls, pose: RelativePose, cells: np.ndarray, disparity: np.ndarray, probability: np.ndarray) -> Self:
         """Of matches (M,) in these cells, each with the disparity of its point and the probability that it is right."""
         return cls(pose, explained_area(cells, pose.inliers, probability), float(np.median(disparity[pose.inliers])))
 
