@@ -4,11 +4,9 @@ In the body's frame it is the camera that moves, so the tracker is the same; the
 where landmarks may be: on the body (`BodyAdmission`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -86,9 +84,9 @@ class ObjectEstimate:
         covariance = turn_covariance(self.camera.T_world_camera, covariance)
         return np.asarray(0.5 * (covariance + covariance.T))
 
-    def map_camera(self, change: Callable[[Estimate], Estimate]) -> ObjectEstimate:
+    def map_camera(self, change: Callable[[Estimate], Estimate]) -> Self:
         """The result with another camera estimate."""
-        return ObjectEstimate(change(self.camera))
+        return replace(self, camera=change(self.camera))
 
 
 class ObjectTracker:

@@ -5,10 +5,9 @@ matrix and a gradient of the rig alone: the sum of these is what is solved, and 
 of one image are wrong together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -67,7 +66,7 @@ class Rig:
             names += [f"{name}.{each}" for each in (*INTRINSICS, *lens)]
         return (*names, *(f"T_left_right.{each}" for each in EXTRINSICS if len(self.eyes) > 1))
 
-    def moved(self, step: np.ndarray) -> Rig:
+    def moved(self, step: np.ndarray) -> Self:
         """With the parameters changed by (P,)."""
         eyes, used = [], 0
         for eye in self.eyes:
@@ -76,7 +75,7 @@ class Rig:
             used += count
         if len(eyes) == 1:
             return replace(self, eyes=tuple(eyes))
-        return Rig(tuple(eyes), nearest_rigid(se3_exp(step[used:]) @ self.T_left_right))
+        return replace(self, eyes=tuple(eyes), T_left_right=nearest_rigid(se3_exp(step[used:]) @ self.T_left_right))
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,8 @@ common, and poses move along with it: a pixel more is 0.4 to 0.9 m of a car's wa
 another offset is its regression on the offset, and costs nothing.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -31,14 +30,14 @@ class HeldOffset:
     value: float | None = None
     is_moving: bool = True
 
-    def following(self, state: WindowState) -> HeldOffset:
+    def following(self, state: WindowState) -> Self:
         """After a keyframe is added to a window."""
         if len(state) < 2 and self.value is None:
             return self
         estimate, sigma = float(state.calibration[0]), float(np.sqrt(state.covariance[0, 0]))
         before = estimate if self.value is None else self.value
         value = float(np.clip(before, estimate - _AGREES * sigma, estimate + _AGREES * sigma))
-        return HeldOffset(value, value != self.value)
+        return replace(self, value=value, is_moving=value != self.value)
 
     def place(
         self, pose: np.ndarray, estimate: float, covariance: np.ndarray, part: slice

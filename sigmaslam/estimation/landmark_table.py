@@ -1,8 +1,7 @@
 """The landmarks of a window and the views of them, as tables."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -26,17 +25,17 @@ class LandmarkViews(Table):
     noise: np.ndarray
     common: np.ndarray
 
-    def inflated(self, factor: float) -> LandmarkViews:
+    def inflated(self, factor: float) -> Self:
         """The same views with so many times the variance."""
         return replace(self, noise=factor * self.noise, common=np.sqrt(factor) * self.common)
 
-    def renumber(self, new_row: np.ndarray) -> LandmarkViews:
+    def renumber(self, new_row: np.ndarray) -> Self:
         """Views of landmarks that stay, by their new rows: new_row (L,) as of `KeyframeWindow.marginalise_oldest`."""
         kept = self.select(new_row[self.landmark] >= 0)
         return replace(kept, landmark=new_row[kept.landmark])
 
     @classmethod
-    def empty(cls) -> LandmarkViews:
+    def empty(cls) -> Self:
         """No views."""
         return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 2)))
 
@@ -63,14 +62,14 @@ class KeyframeViews(Table):
     keyframe: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     views: LandmarkViews = field(default_factory=LandmarkViews.empty)
 
-    def append(self, keyframe: int, views: LandmarkViews) -> KeyframeViews:
+    def append(self, keyframe: int, views: LandmarkViews) -> Self:
         """These and what one more keyframe sees."""
-        return self.concatenate([self, KeyframeViews(np.full(len(views), keyframe), views)])
+        return self.concatenate([self, replace(self, keyframe=np.full(len(views), keyframe), views=views)])
 
-    def without_oldest(self, new_row: np.ndarray) -> KeyframeViews:
+    def without_oldest(self, new_row: np.ndarray) -> Self:
         """Views of landmarks that stay when the oldest keyframe leaves: new_row (L,) as of `LandmarkViews.renumber`."""
         keyframe = self.keyframe[new_row[self.views.landmark] >= 0] - 1
-        return KeyframeViews(keyframe, self.views.renumber(new_row))
+        return replace(self, keyframe=keyframe, views=self.views.renumber(new_row))
 
 
 @dataclass(slots=True)
@@ -105,7 +104,7 @@ class LandmarkTable(Table):
     disparity_range: np.ndarray
 
     @classmethod
-    def empty(cls, size: int) -> LandmarkTable:
+    def empty(cls, size: int) -> Self:
         """No landmark, for a state of that size."""
         whole = np.zeros(0, np.int64)
         flat, square = np.zeros((0, LANDMARK_SIZE)), np.zeros((0, LANDMARK_SIZE, LANDMARK_SIZE))

@@ -5,9 +5,8 @@ them share, so that the errors of successive steps nearly cancel: on a simulated
 steps add up to four to eight times what they make together. So the covariance of all of them is kept.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -34,7 +33,7 @@ class PastPoses:
     common: np.ndarray
 
     @classmethod
-    def empty(cls) -> PastPoses:
+    def empty(cls) -> Self:
         """None, beside a window without keyframes."""
         none = np.zeros((0, CALIBRATION_SIZE))
         return cls(np.zeros((0, 4, 4)), np.zeros((0, 0)), none, none)
@@ -79,7 +78,7 @@ class PastPoses:
 
     def grow(
         self, window: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None
-    ) -> tuple[np.ndarray, PastPoses]:
+    ) -> tuple[np.ndarray, Self]:
         """Covariance of the window, and these, when a pose is appended there.
 
         Args:
@@ -106,7 +105,7 @@ class PastPoses:
 
     def add_loop_constraint(
         self, window: np.ndarray, common: np.ndarray, index: int, difference: np.ndarray, covariance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, PastPoses]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Self]:
         """Posterior when the window's last pose has been measured relative to the pose `index`.
 
         Args:
@@ -134,29 +133,29 @@ class PastPoses:
         )
         return gain @ difference, root @ root.T, common - gain @ apart, past
 
-    def drop(self, index: int) -> PastPoses:
+    def drop(self, index: int) -> Self:
         """Those but one."""
         rest = np.delete(np.arange(6 * len(self)), past_slice(index))
         poses = np.delete(self.poses, index, axis=0)
-        return PastPoses(poses, self.covariance[np.ix_(rest, rest)], self.cross[rest], self.common[rest])
+        return type(self)(poses, self.covariance[np.ix_(rest, rest)], self.cross[rest], self.common[rest])
 
-    def append(self, pose: np.ndarray, window: np.ndarray, common: np.ndarray, place: slice) -> PastPoses:
+    def append(self, pose: np.ndarray, window: np.ndarray, common: np.ndarray, place: slice) -> Self:
         """These and a pose of the window, which stays there; window (n, n) and common (n, 15) are of its state."""
         across = self.cross[:, place]
         covariance = np.block([[self.covariance, across], [across.T, window[place, place]]])
-        return PastPoses(
+        return type(self)(
             np.concatenate([self.poses, pose[None]]),
             covariance,
             np.concatenate([self.cross, window[place]]),
             np.concatenate([self.common, common[place]]),
         )
 
-    def moved(self, step: np.ndarray, covariance: np.ndarray, cross: np.ndarray, common: np.ndarray) -> PastPoses:
+    def moved(self, step: np.ndarray, covariance: np.ndarray, cross: np.ndarray, common: np.ndarray) -> Self:
         """The poses moved by (6 K,), with other errors."""
         poses = nearest_rigid(se3_exp(step.reshape(-1, 6)) @ self.poses)
-        return PastPoses(poses, 0.5 * (covariance + covariance.T), cross, common)
+        return type(self)(poses, 0.5 * (covariance + covariance.T), cross, common)
 
-    def given(self, factor: np.ndarray, common: np.ndarray, information: np.ndarray, vector: np.ndarray) -> PastPoses:
+    def given(self, factor: np.ndarray, common: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Self:
         """Their posterior when something is learned about the window.
 
         Args:

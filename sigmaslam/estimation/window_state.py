@@ -1,8 +1,7 @@
 """The Gaussian of a window: stereo calibration, keyframe poses, and the poses that left the window."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -33,7 +32,7 @@ class WindowState:
     past: PastPoses
 
     @classmethod
-    def initial(cls, calibration: CalibrationPrior) -> WindowState:
+    def initial(cls, calibration: CalibrationPrior) -> Self:
         """No poses; calibration errors of mean zero."""
         covariance, common = calibration.estimated_covariance, calibration.considered_factor
         return cls(np.zeros(CALIBRATION_SIZE), np.zeros((0, 4, 4)), covariance, common, PastPoses.empty())
@@ -58,18 +57,18 @@ class WindowState:
             np.concatenate([past.common, self.common[CALIBRATION_SIZE:]]),
         )
 
-    def minus(self, other: WindowState) -> np.ndarray:
+    def minus(self, other: Self) -> np.ndarray:
         """(n,) error-state difference of two means."""
         poses = se3_log(self.poses @ se3_inverse(other.poses)).ravel()
         return np.r_[self.calibration - other.calibration, poses]
 
-    def moved(self, step: np.ndarray, covariance: np.ndarray, common: np.ndarray) -> WindowState:
+    def moved(self, step: np.ndarray, covariance: np.ndarray, common: np.ndarray) -> Self:
         """The means moved by an error-state step (n,), with other errors; marginalised poses stay."""
         poses = nearest_rigid(se3_exp(step[CALIBRATION_SIZE:].reshape(-1, 6)) @ self.poses)
         calibration = self.calibration + step[CALIBRATION]
         return replace(self, calibration=calibration, poses=poses, covariance=covariance, common=common)
 
-    def given(self, information: np.ndarray, vector: np.ndarray, condition: Step) -> WindowState:
+    def given(self, information: np.ndarray, vector: np.ndarray, condition: Step) -> Self:
         """Posterior when exp(-x^T information x / 2 + vector^T x) is learned about the error state x.
 
         Args:
@@ -84,7 +83,7 @@ class WindowState:
 
     def with_errors(
         self, index: np.ndarray, value: np.ndarray, by_error: np.ndarray, to_factor: np.ndarray
-    ) -> tuple[WindowState, np.ndarray]:
+    ) -> tuple[Self, np.ndarray]:
         """As if considered errors of the calibration had other means, and all of them another covariance.
 
         Args:
@@ -102,9 +101,7 @@ class WindowState:
         step = slope @ change
         return replace(self.moved(step, self.covariance, self.common @ to_factor), past=past), step
 
-    def grow(
-        self, pose: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None = None
-    ) -> WindowState:
+    def grow(self, pose: np.ndarray, step_covariance: np.ndarray, walk: np.ndarray, origin: int | None = None) -> Self:
         """Appends a pose.
 
         Args:
@@ -125,7 +122,7 @@ class WindowState:
             self, poses=poses, covariance=covariance, common=np.concatenate([self.common, common]), past=past
         )
 
-    def marginalise_oldest(self) -> WindowState:
+    def marginalise_oldest(self) -> Self:
         """Moves the oldest pose to the past."""
         oldest = pose_slice(0)
         remaining = np.r_[0:CALIBRATION_SIZE, oldest.stop : len(self.covariance)]
@@ -138,7 +135,7 @@ class WindowState:
             past=replace(past, cross=past.cross[:, remaining]),
         )
 
-    def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> WindowState:
+    def add_loop_constraint(self, index: int, T_past_last: np.ndarray, covariance: np.ndarray) -> Self:
         """Posterior when the last pose has been measured relative to a marginalised one: a loop is closed.
 
         Args:
@@ -152,10 +149,10 @@ class WindowState:
         )
         return replace(self.moved(step, posterior, common), past=past)
 
-    def without_poses(self) -> WindowState:
+    def without_poses(self) -> Self:
         """What is known of the calibration alone."""
         covariance, common = self.covariance[CALIBRATION, CALIBRATION], self.common[CALIBRATION]
-        return WindowState(self.calibration, np.zeros((0, 4, 4)), covariance, common, PastPoses.empty())
+        return type(self)(self.calibration, np.zeros((0, 4, 4)), covariance, common, PastPoses.empty())
 
 
 def loop_difference(state: WindowState, index: int, T_past_last: np.ndarray) -> np.ndarray:

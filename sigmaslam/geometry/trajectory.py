@@ -1,8 +1,7 @@
 """Poses of the camera over time."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -51,6 +50,6 @@ class Trajectory:
         """Metres travelled from the first pose to the last."""
         return float(self.distances[-1]) if len(self) else 0.0
 
-    def subset(self, index: np.ndarray) -> Trajectory:
+    def subset(self, index: np.ndarray) -> Self:
         """The poses at `index`, an index array, mask or slice."""
-        return Trajectory(self.timestamps[index], self.poses[index])
+        return replace(self, timestamps=self.timestamps[index], poses=self.poses[index])

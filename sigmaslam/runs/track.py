@@ -1,7 +1,5 @@
 """Tracking a whole sequence, from disk or live, into a run folder."""
 
-from __future__ import annotations
-
 import math
 import signal
 import time
@@ -202,6 +200,23 @@ def _describe_location(location: LocationFilter | None) -> dict[str, Any]:
     }
 
 
+@dataclass(slots=True)
+class _Samples:
+    """Samples of a sensor of motion: columns (N, ...), the times first, and what takes them one by one."""
+
+    columns: Sequence[np.ndarray]
+    shift: float
+    add: Callable[..., None]
+    given: int = 0
+
+    def feed(self, timestamp: float) -> None:
+        """Gives those up to a frame that were not given yet, and the one behind it."""
+        end = int(np.searchsorted(self.columns[0], timestamp + self.shift)) + 1
+        for row in zip(*(each[self.given : end] for each in self.columns), strict=True):
+            self.add(*row)
+        self.given = max(self.given, end)
+
+
 @dataclass(frozen=True, slots=True)
 class _FrameSteps:
     """What each frame goes through."""
@@ -221,23 +236,6 @@ class _FrameSteps:
         estimate = self.tracker.step(frame.left, frame.right, frame.timestamp, frame.mask)
         self.timing.note(frame.timestamp)
         return estimate if self.location is None else estimate.map_camera(self.location.fuse)
-
-
-@dataclass(slots=True)
-class _Samples:
-    """Samples of a sensor of motion: columns (N, ...), the times first, and what takes them one by one."""
-
-    columns: Sequence[np.ndarray]
-    shift: float
-    add: Callable[..., None]
-    given: int = 0
-
-    def feed(self, timestamp: float) -> None:
-        """Gives those up to a frame that were not given yet, and the one behind it."""
-        end = int(np.searchsorted(self.columns[0], timestamp + self.shift)) + 1
-        for row in zip(*(each[self.given : end] for each in self.columns), strict=True):
-            self.add(*row)
-        self.given = max(self.given, end)
 
 
 def _sensors(sequence: StereoSequence, tracker: Tracker) -> list[_Samples]:

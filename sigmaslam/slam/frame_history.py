@@ -5,10 +5,9 @@ frame says of itself is relative to the keyframe before it. It is smoothed with 
 takes a share of what that one is corrected by relative to the first.
 """
 
-from __future__ import annotations
-
 from array import array
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -41,20 +40,20 @@ class HangingFrames(Table):
     share: np.ndarray
 
     @classmethod
-    def of(cls, step: np.ndarray, spread: np.ndarray, share: np.ndarray) -> HangingFrames:
+    def of(cls, step: np.ndarray, spread: np.ndarray, share: np.ndarray) -> Self:
         """From arrays of any precision."""
         return cls(nearest_rigid(step), spread.astype(np.float32), share.astype(np.float32))
 
     @classmethod
-    def at_first(cls, motion: SmoothedMotion) -> HangingFrames:
+    def at_first(cls, motion: SmoothedMotion) -> Self:
         """Frames that take no share of what the second keyframe is corrected by."""
         return cls.of(motion.step, motion.covariance, np.zeros_like(motion.covariance))
 
-    def corrected(self, correction: np.ndarray) -> HangingFrames:
+    def corrected(self, correction: np.ndarray) -> Self:
         """The frames when the second keyframe is moved by (6,), perturbed from the left in the first one."""
         return replace(self, step=nearest_rigid(se3_exp(self.share @ correction) @ self.step))
 
-    def handed_over(self, T_heir_first: np.ndarray, residual: np.ndarray) -> HangingFrames:
+    def handed_over(self, T_heir_first: np.ndarray, residual: np.ndarray) -> Self:
         """The frames in the frame of another first keyframe, the old one being known relative to it.
 
         Args:
@@ -65,7 +64,7 @@ class HangingFrames(Table):
         share = adjoint @ self.share @ se3_adjoint(se3_inverse(T_heir_first))
         rest = np.eye(6) - share
         spread = adjoint @ self.spread @ adjoint.T + rest @ residual @ rest.transpose(0, 2, 1)
-        return HangingFrames.of(T_heir_first @ self.step, spread, share)
+        return self.of(T_heir_first @ self.step, spread, share)
 
     def between(self, first: int, last: int, keyframes: PastPoses) -> tuple[np.ndarray, np.ndarray]:
         """Poses (N, 4, 4) in the world and covariances (N, 6, 6), perturbed from the left there.
@@ -93,9 +92,9 @@ class _Interval:
     frames: HangingFrames
     step: np.ndarray
 
-    def settled(self, step: np.ndarray) -> _Interval:
+    def settled(self, step: np.ndarray) -> Self:
         """The frames when the step between the keyframes is this one."""
-        return _Interval(self.frames.corrected(se3_log(step @ se3_inverse(self.step))), step)
+        return replace(self, frames=self.frames.corrected(se3_log(step @ se3_inverse(self.step))), step=step)
 
 
 class FrameHistory:

@@ -1,8 +1,7 @@
 """Relative orientation of two calibrated views from matches: the 5-point method, then least squares by covariance."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -123,9 +122,9 @@ class MatchedRays:
         sigma = np.sqrt(np.maximum(variance, 1e-24))
         return (self.rays1 * by1).sum(axis=1) / sigma, sigma
 
-    def chosen(self, rows: np.ndarray) -> MatchedRays:
+    def chosen(self, rows: np.ndarray) -> Self:
         """Some of the matches."""
-        return MatchedRays(self.rays0[rows], self.rays1[rows], self.spread0, self.spread1[rows])
+        return replace(self, rays0=self.rays0[rows], rays1=self.rays1[rows], spread1=self.spread1[rows])
 
     def in_front(self, R: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """(M,) bool, whether the rays meet in front of both cameras, or are parallel within their errors."""
