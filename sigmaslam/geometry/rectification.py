@@ -83,11 +83,14 @@ class StereoRectifier:
                 )
         if self._maps is None:
             return left, right
-        left_map, right_map = self._maps
-        return (
-            cv2.remap(left, *left_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT),
-            cv2.remap(right, *right_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT),
-        )
+        right = cv2.remap(right, *self._maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return self.rectify_left(left), np.asarray(right)
+
+    def rectify_left(self, image: np.ndarray) -> np.ndarray:
+        """A left image alone, as `rectify` does it."""
+        if self._maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *self._maps[0], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
     def raise_right(self, rows: float) -> None:
         """From now on the right images, which a bump has lowered by so many rows, are raised by them."""

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from sigmaslam.bodies.object_tracker import ObjectEstimate
 from sigmaslam.errors import InputError
 from sigmaslam.slam.estimate import Estimate
@@ -26,11 +28,13 @@ class TrackedFrame:
         number: of its row in frames.csv, from 0 on.
         result: of the tracker.
         seen: the images with their matches; None where a caller has none.
+        colour: of the frame, as `StereoFrame` has it.
     """
 
     number: int
     result: Estimate | ObjectEstimate
     seen: MatchedFrame | None
+    colour: np.ndarray | None = None
 
 
 class FrameSink(Protocol):

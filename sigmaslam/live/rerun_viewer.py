@@ -94,11 +94,11 @@ class RerunSink:
         if estimate.dof:
             self._plot("nis_per_dof", estimate.nis / estimate.dof)
 
-    def show_cloud(self, points: np.ndarray, grey: np.ndarray) -> None:
-        """Shows points (N, 3) of a dense cloud, metres, with their grey values (N,), from now on."""
-        colours = np.repeat(grey[:, None].astype(np.uint8), 3, axis=1)
+    def show_cloud(self, points: np.ndarray, colours: np.ndarray) -> None:
+        """Shows points (N, 3) of a dense cloud, metres, with red, green and blue (N, 3) to 255, from now on."""
         self._clouds += 1
-        self._recording.log(f"world/dense/{self._clouds}", rr.Points3D(points, colors=colours), static=True)
+        cloud = rr.Points3D(points, colors=colours.astype(np.uint8))
+        self._recording.log(f"world/dense/{self._clouds}", cloud, static=True)
 
     def close(self) -> None:
         """No frame comes any more. A window that was closed before is no error; a file that is not whole is."""

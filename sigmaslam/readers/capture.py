@@ -12,7 +12,7 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import RawPair
 from sigmaslam.readers.pairing import STAMP_TOLERANCE_NS
-from sigmaslam.readers.video import split_halves, to_grey
+from sigmaslam.readers.video import split_halves
 
 logger = logging.getLogger(__name__)
 
@@ -123,7 +123,7 @@ class StereoCapture:
             if not done:
                 self.failed = name
                 return None
-            images.append(to_grey(image))
+            images.append(image)
         if len(images) == 2:
             self._check_synchrony(abs(times[1] - times[0]))
             return RawPair(index, times[0], images[0], images[1], *self._names)

@@ -13,7 +13,7 @@ from sigmaslam.calibration_files.calibration import find_calibration, read_calib
 from sigmaslam.calibration_files.lens_models import ImageSize
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.camera import StereoCamera
-from sigmaslam.readers.images import IMAGE_SUFFIXES, PairSource, RawPair
+from sigmaslam.readers.images import IMAGE_SUFFIXES, GreyConverter, PairSource, RawPair
 from sigmaslam.readers.kitti import common_size
 from sigmaslam.readers.stereo_sequence import StereoSequence
 
@@ -173,10 +173,10 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
     Raises:
         InputError: there is no such video, or it cannot be decoded.
     """
-    capture = _open(path)
+    capture, grey = _open(path), GreyConverter()
     try:
         while (image := _next_image(capture)) is not None:
-            yield image
+            yield grey.convert(image, str(path))
     finally:
         capture.release()
 
@@ -193,14 +193,9 @@ def split_halves(image: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(left), np.ascontiguousarray(right)
 
 
-def to_grey(image: np.ndarray) -> np.ndarray:
-    """Grey image of a captured one; OpenCV gives BGR for grey videos, too, so there is no warning about colour."""
-    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-
-
 def _next_image(capture: cv2.VideoCapture) -> np.ndarray | None:
     ok, image = capture.read()
-    return to_grey(image) if ok else None
+    return image if ok else None
 
 
 def _seconds(capture: cv2.VideoCapture) -> float:

@@ -34,13 +34,13 @@ class DenseCloud(Table):
     Attributes:
         points: (N, 3) in the world, metres.
         covariances: (N, 6) of them, float32: xx, xy, xz, yy, yz, zz, metres squared.
-        intensity: (N,) float32 grey values, 0 to 255.
+        colours: (N, 3) float32 red, green and blue, 0 to 255; equal where images are grey.
         views: (N,) int32 depths of keyframes that were merged into the point.
     """
 
     points: np.ndarray
     covariances: np.ndarray
-    intensity: np.ndarray
+    colours: np.ndarray
     views: np.ndarray
 
     @property
@@ -84,19 +84,19 @@ class DepthPixels(Table):
         pixels: (N, 2) int64 (u, v).
         disparity: (N,) inverse depth times focal length and baseline, pixels.
         variance: (N,) of it, pixels squared.
-        intensity: (N,) uint8 grey value.
+        colours: (N, 3) uint8 red, green and blue.
     """
 
     pixels: np.ndarray
     disparity: np.ndarray
     variance: np.ndarray
-    intensity: np.ndarray
+    colours: np.ndarray
 
     @classmethod
-    def of(cls, disparity: np.ndarray, variance: np.ndarray, image: np.ndarray, chosen: np.ndarray) -> Self:
-        """The chosen pixels, (H, W) bool, of such images (H, W); disparities there are positive."""
+    def of(cls, disparity: np.ndarray, variance: np.ndarray, picture: np.ndarray, chosen: np.ndarray) -> Self:
+        """The chosen pixels, (H, W) bool, of such images (H, W), the picture (H, W, 3); disparities are positive."""
         values, variances = (each[chosen].astype(float) for each in (disparity, variance))
-        return cls(np.argwhere(chosen)[:, ::-1], values, variances, image[chosen])
+        return cls(np.argwhere(chosen)[:, ::-1], values, variances, picture[chosen])
 
     def points(self, camera: RectifiedStereo) -> np.ndarray:
         """(N, 3) in the rectified left camera, metres."""
@@ -128,7 +128,7 @@ class DepthPixels(Table):
         return DenseCloud(
             transform_points(pose, points),
             covariances.astype(np.float32),
-            self.intensity.astype(np.float32),
+            self.colours.astype(np.float32),
             np.ones(len(points), np.int32),
         )
 
@@ -160,7 +160,7 @@ class VoxelCloud:
 
     Args:
         size: of the finest voxel, metres.
-        most: voxels in memory, of 110 bytes.
+        most: voxels in memory, of 126 bytes.
     """
 
     def __init__(self, size: float, most: int = 2_000_000) -> None:
@@ -173,7 +173,7 @@ class VoxelCloud:
 
     def add(self, cloud: DenseCloud, sigma: np.ndarray) -> None:
         """Takes the points of a keyframe, and their sigmas (N,) without the pose's, metres."""
-        self._voxels.add(cloud.points, cloud.covariances, sigma, cloud.intensity, cloud.views)
+        self._voxels.add(cloud.points, cloud.covariances, sigma, cloud.colours, cloud.views)
         if len(self._voxels) > self._most:
             self._written.append(Path(self._folder.name) / f"{len(self._written)}.npz")
             np.savez(self._written[-1], *self._voxels.rows(0))
@@ -188,7 +188,7 @@ class VoxelCloud:
         keys, levels, sums = self._voxels.rows(min_views)
         order = np.argsort(keys)
         keys, levels, sums = keys[order], levels[order], sums[order]
-        information, count = sums[:, :6], sums[:, 10]
+        information, count = sums[:, :6], sums[:, 12]
         covariance = inverse(information)
         points = _times(covariance, sums[:, 6:9])
         finest = np.ones(len(keys), bool)
@@ -199,7 +199,7 @@ class VoxelCloud:
         return DenseCloud(
             points,
             (covariance * count[:, None]).astype(np.float32),
-            (sums[:, 9] / count).astype(np.float32),
+            (sums[:, 9:12] / count[:, None]).astype(np.float32),
             count.astype(np.int32),
         ).select(finest)
 
@@ -215,15 +215,15 @@ class Voxels:
 
     def __init__(self, size: float, share: float, most_level: int) -> None:
         assert (share, most_level) == (_SIGMA_SHARE, _MOST_LEVEL)
-        self._size, self._rows = size, (np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros((0, 11)))
+        self._size, self._rows = size, (np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros((0, 13)))
 
     def __len__(self) -> int:
         return len(self._rows[0])
 
-    def add(self, points: np.ndarray, covariances: np.ndarray, sigma: np.ndarray, *grey_and_views: np.ndarray) -> None:
-        """Takes points (N, 3), covariances (N, 6), sigmas without the pose's, grey values and views (N,)."""
-        information, (grey, views) = inverse(covariances.astype(np.float64)), grey_and_views
-        sums = np.column_stack([information, _times(information, points), grey * views, views])
+    def add(self, points: np.ndarray, covariances: np.ndarray, sigma: np.ndarray, *seen: np.ndarray) -> None:
+        """Takes points (N, 3), covariances (N, 6), sigmas without the pose's, colours (N, 3), views (N,)."""
+        information, (colours, views) = inverse(covariances.astype(np.float64)), seen
+        sums = np.column_stack([information, _times(information, points), colours * views[:, None], views])
         cells = _voxels(points, sigma, self._size)
         self.merge(cells @ _ONE_KEY, cells[:, 3].astype(np.uint8), sums)
 
@@ -235,9 +235,9 @@ class Voxels:
         self._rows = keys[order[first]], levels[order[first]], total
 
     def rows(self, min_views: int) -> tuple[np.ndarray, ...]:
-        """Packed voxels and their levels (M,), and (M, 11) sums of information, that times points, grey values and
+        """Packed voxels and their levels (M,), and (M, 13) sums of information, that times points, colours and
         views, of those that so many views or more gave."""
-        seen = self._rows[2][:, 10] >= min_views
+        seen = self._rows[2][:, 12] >= min_views
         return tuple(each[seen] for each in self._rows)
 
 
@@ -256,9 +256,10 @@ def _at_level(points: np.ndarray, level: np.ndarray | int, size: float) -> np.nd
 
 
 def write_cloud(path: Path, cloud: DenseCloud) -> None:
-    """A binary PLY: x, y, z, grey value as red, green and blue, sigma, six numbers of the covariance, and views."""
+    """A binary PLY: x, y, z, red, green, blue, sigma, six numbers of the covariance, and views."""
     columns = {name: ("float", cloud.points[:, axis]) for axis, name in enumerate("xyz")}
-    columns |= dict.fromkeys(("red", "green", "blue"), ("uchar", np.clip(np.rint(cloud.intensity), 0, 255)))
+    colours = np.clip(np.rint(cloud.colours), 0, 255)
+    columns |= {name: ("uchar", colours[:, k]) for k, name in enumerate(("red", "green", "blue"))}
     columns["sigma"] = ("float", cloud.sigma)
     columns |= {name: ("float", cloud.covariances[:, k]) for k, name in enumerate(_COVARIANCE_NAMES)}
     columns["views"] = ("int", cloud.views)

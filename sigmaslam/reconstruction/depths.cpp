@@ -253,10 +253,10 @@ class Voxels {
 public:
     Voxels(double size, double sigma_share, int most_level) : grid_(size, sigma_share, most_level) {}
 
-    // Points (N, 3) with covariances (N, 6), sigmas without the pose's, grey values and views (N,).
-    void add(const Doubles& points, const Reals& covariances, const Doubles& sigma, const Reals& grey, const Counts& views) {
+    // Points (N, 3) with covariances (N, 6), sigmas without the pose's, colours (N, 3) and views (N,).
+    void add(const Doubles& points, const Reals& covariances, const Doubles& sigma, const Reals& colours, const Counts& views) {
         const py::ssize_t n = sigma.size();
-        check(points.size() == 3 * n && covariances.size() == 6 * n && grey.size() == n && views.size() == n,
+        check(points.size() == 3 * n && covariances.size() == 6 * n && colours.size() == 3 * n && views.size() == n,
               "all arrays must have a row for each point");
         constexpr py::ssize_t ahead = 16;  // rows whose sums are on their way from memory, and twice as many slots
         std::vector<int64_t> keys(n);
@@ -284,8 +284,8 @@ public:
             sums[6] = sums[0] * p[0] + sums[1] * p[1] + sums[2] * p[2];
             sums[7] = sums[1] * p[0] + sums[3] * p[1] + sums[4] * p[2];
             sums[8] = sums[2] * p[0] + sums[4] * p[1] + sums[5] * p[2];
-            sums[9] = static_cast<double>(grey.data()[k]) * views.data()[k];
-            sums[10] = views.data()[k];
+            for (int i = 0; i < 3; ++i) sums[9 + i] = static_cast<double>(colours.data()[3 * k + i]) * views.data()[k];
+            sums[12] = views.data()[k];
             add_row(keys[k], levels[k], sums);
         }
     }
@@ -297,11 +297,11 @@ public:
         for (py::ssize_t k = 0; k < n; ++k) add_row(keys.data()[k], levels.data()[k], sums.data() + SUMS * k);
     }
 
-    // Packed voxels and their levels (M,), and sums (M, 11), of those that so many views or more gave.
+    // Packed voxels and their levels (M,), and sums (M, 13), of those that so many views or more gave.
     py::tuple rows(double min_views) const {
         std::vector<size_t> chosen;
         for (size_t k = 0; k < count(); ++k)
-            if (row(k)[10] >= min_views) chosen.push_back(k);
+            if (row(k)[12] >= min_views) chosen.push_back(k);
         const auto n = static_cast<py::ssize_t>(chosen.size());
         Rows keys(n);
         Grey levels(n);
@@ -317,7 +317,7 @@ public:
     size_t count() const { return numbers_.keys.size(); }
 
 private:
-    static constexpr int SUMS = 11;
+    static constexpr int SUMS = 13;
     static constexpr size_t BLOCK = 1 << 14;  // rows that are allocated at once and never moved
 
     double* row(size_t number) const { return blocks_[number / BLOCK].get() + SUMS * (number % BLOCK); }

@@ -13,7 +13,14 @@ from sigmaslam.live.frame_sink import TrackedFrame
 from sigmaslam.reconstruction.cloud import VoxelCloud, write_cloud
 from sigmaslam.reconstruction.depth_fusion import DepthView
 from sigmaslam.reconstruction.disparity import semi_global_disparity
-from sigmaslam.reconstruction.reconstruct import NEIGHBOURS, default_voxel, fuse_keyframe, least_views, measure_view
+from sigmaslam.reconstruction.reconstruct import (
+    NEIGHBOURS,
+    default_voxel,
+    fuse_keyframe,
+    least_views,
+    make_picture,
+    measure_view,
+)
 from sigmaslam.reconstruction.recorded_keyframes import MOST_FRAMES, RecordedKeyframes
 from sigmaslam.run_record.dense_points import DENSE_NAME, write_dense_points
 from sigmaslam.run_record.relative_pose_file import FramePairs
@@ -30,7 +37,7 @@ class CloudSink:
         path: PLY file of the cloud.
         run: folder of the run, whose report shows it.
         camera: of the run.
-        show: takes points (N, 3) of each keyframe, metres, and their grey values (N,).
+        show: takes points (N, 3) of each keyframe, metres, and their colours (N, 3), red, green and blue to 255.
     """
 
     def __init__(
@@ -56,7 +63,10 @@ class CloudSink:
         self._since = 0
         offset = said.calibration.disparity_offset
         view = measure_view(seen.left, seen.right, self._rectifier, semi_global_disparity, offset, seen.usable)
-        self._views = [*self._views[-2 * NEIGHBOURS :], (said, seen.left.copy(), view)]
+        self._views = [
+            *self._views[-2 * NEIGHBOURS :],
+            (said, make_picture(seen.left, frame.colour, self._rectifier), view),
+        ]
         if len(self._views) > NEIGHBOURS:
             self._fuse(len(self._views) - 1 - NEIGHBOURS)
 
@@ -67,7 +77,7 @@ class CloudSink:
             raise InputError("no keyframe has a pose: track a longer sequence")
         points = self._cloud.cloud(least_views(self._keyframes))
         write_cloud(self._path, points)
-        write_dense_points(self._run / DENSE_NAME, points.points, points.sigma, points.intensity)
+        write_dense_points(self._run / DENSE_NAME, points.points, points.sigma, points.colours)
 
     def _fuse_last(self) -> None:
         """Fuses the views that wait for others: none come, or from another place of the world."""
@@ -78,13 +88,13 @@ class CloudSink:
     def _fuse(self, number: int) -> None:
         if self._views[number][0].tracks is None:
             return
-        views = {k: (image, view) for k, (_, image, view) in enumerate(self._views)}
+        views = {k: (picture, view) for k, (_, picture, view) in enumerate(self._views)}
         depth = fuse_keyframe(number, views, self._recorded(), self._rectifier)
         self._cloud = self._cloud or VoxelCloud(default_voxel(depth, self._rectifier.rectified))
         points, sigma = depth.cloud(self._rectifier.rectified, self._cloud.size)
         self._cloud.add(points, sigma)
         if self._show is not None:
-            self._show(points.points, points.intensity)
+            self._show(points.points, points.colours)
         self._keyframes += 1
 
     def _recorded(self) -> RecordedKeyframes:

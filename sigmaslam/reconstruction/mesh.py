@@ -55,26 +55,26 @@ class DepthVolume:
             device=core.Device("CPU:0"),
         )
 
-    def integrate(self, depth: np.ndarray, image: np.ndarray, pose: np.ndarray) -> None:
+    def integrate(self, depth: np.ndarray, picture: np.ndarray, pose: np.ndarray) -> None:
         """Takes a depth map.
 
         Args:
             depth: (H, W) float32 metres, 0 where there is none.
-            image: (H, W) uint8 grey values.
+            picture: (H, W, 3) uint8 red, green and blue.
             pose: (4, 4) T_world_camera.
         """
         if not ((depth > 0.0) & (depth < self._farthest)).any():
             return
         self._is_empty = False
-        core, picture = self._library.core, self._library.t.geometry.Image
-        depths = picture(core.Tensor(np.ascontiguousarray(depth)))
-        grey = picture(core.Tensor(np.repeat(image[..., None].astype(np.float32) / 255.0, 3, axis=2)))
+        core, image = self._library.core, self._library.t.geometry.Image
+        depths = image(core.Tensor(np.ascontiguousarray(depth)))
+        colours = image(core.Tensor(picture.astype(np.float32) / 255.0))
         view = self._intrinsics, core.Tensor(np.ascontiguousarray(se3_inverse(pose)))
         blocks = self._grid.compute_unique_block_coordinates(depths, *view, 1.0, self._farthest, _TRUNCATION)
-        self._grid.integrate(blocks, depths, grey, *view, 1.0, self._farthest, _TRUNCATION)
+        self._grid.integrate(blocks, depths, colours, *view, 1.0, self._farthest, _TRUNCATION)
 
     def write(self, path: Path) -> None:
-        """Writes the mesh as PLY, with normals and grey values.
+        """Writes the mesh as PLY, with normals and colours.
 
         Raises:
             InputError: no surface was seen, or the file cannot be written.

@@ -35,10 +35,10 @@ class PosedImages:
         (folder / "images").mkdir(parents=True)
         (folder / "sparse" / "0").mkdir(parents=True)
 
-    def add(self, image: np.ndarray, pose: np.ndarray) -> None:
-        """Takes an image (H, W) uint8 and its pose (4, 4) T_world_camera."""
+    def add(self, picture: np.ndarray, pose: np.ndarray) -> None:
+        """Takes a picture (H, W, 3) uint8, red, green and blue, and its pose (4, 4) T_world_camera."""
         path = self._folder / "images" / _name(len(self._poses))
-        if not cv2.imwrite(str(path), image):
+        if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
             raise InputError(f"{path}: could not be written: choose another place for --export")
         self._poses.append(pose)
 
@@ -63,8 +63,8 @@ class PosedImages:
         atomic_write_text(model / "images.txt", "".join(images))
         rows = np.unique(np.linspace(0, max(len(cloud) - 1, 0), min(len(cloud), _MOST_POINTS)).astype(np.int64))
         lines = [
-            f"{k + 1} {x:.5f} {y:.5f} {z:.5f} {grey:.0f} {grey:.0f} {grey:.0f} 0\n"
-            for k, ((x, y, z), grey) in enumerate(zip(cloud.points[rows], cloud.intensity[rows], strict=True))
+            f"{k + 1} {x:.5f} {y:.5f} {z:.5f} {red:.0f} {green:.0f} {blue:.0f} 0\n"
+            for k, (x, y, z, red, green, blue) in enumerate(np.hstack([cloud.points[rows], cloud.colours[rows]]))
         ]
         atomic_write_text(model / "points3D.txt", "".join(lines))
 

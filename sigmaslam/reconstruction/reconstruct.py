@@ -72,7 +72,7 @@ class KeyframeDepth:
 
     Attributes:
         number: of the keyframe in its run.
-        image: (H, W) uint8 rectified left image.
+        picture: (H, W, 3) uint8 red, green and blue of the rectified left image.
         measured: its own disparities, with the disparity offset taken off.
         fused: the same after fusion.
         pose: (4, 4) T_world_rectified.
@@ -81,7 +81,7 @@ class KeyframeDepth:
     """
 
     number: int
-    image: np.ndarray
+    picture: np.ndarray
     measured: DisparityMap
     fused: FusedDepth
     pose: np.ndarray
@@ -102,7 +102,8 @@ class KeyframeDepth:
 
     def cloud(self, camera: RectifiedStereo, voxel: float) -> tuple[DenseCloud, np.ndarray]:
         """The points in the world, about one a voxel of that side, metres; and their sigmas (N,) by the depth alone."""
-        pixels = DepthPixels.of(self.fused.disparity, self.variance, self.image, self.is_point).thinned(camera, voxel)
+        pixels = DepthPixels.of(self.fused.disparity, self.variance, self.picture, self.is_point)
+        pixels = pixels.thinned(camera, voxel)
         return pixels.cloud(camera, self.pose, self.pose_covariance), pixels.sigma(camera)
 
 
@@ -159,10 +160,10 @@ def reconstruct_run(
                 volume = None if mesh is None else DepthVolume(cloud.size, camera)
             cloud.add(*depth.cloud(camera, cloud.size))
             if posed is not None:
-                posed.add(depth.image, depth.pose)
+                posed.add(depth.picture, depth.pose)
             if volume is not None:
                 z = np.where(chosen, camera.focal_baseline / np.where(chosen, depth.fused.disparity, 1.0), 0.0)
-                volume.integrate(z.astype(np.float32), depth.image, depth.pose)
+                volume.integrate(z.astype(np.float32), depth.picture, depth.pose)
             measured += int(np.isfinite(depth.measured.disparity).sum())
             confirmed += int(chosen.sum())
             progress.update(task, advance=1, note=f"{confirmed / max(measured, 1):.0%} confirmed")
@@ -209,10 +210,11 @@ def fuse_keyframes(
                 rectifier.raise_right(lower)
             left, right = rectifier.rectify(frame.left, frame.right)
             usable = usable_pixels(frame.mask, rectifier)
-            yield number, left, measure_view(left, right, rectifier, match, keyframes.disparity_offset[number], usable)
+            view = measure_view(left, right, rectifier, match, keyframes.disparity_offset[number], usable)
+            yield number, make_picture(left, frame.colour, rectifier), view
 
-    for number, left, view in read_ahead(views, 1):
-        kept[number] = left, view
+    for number, picture, view in read_ahead(views, 1):
+        kept[number] = picture, view
         done = number - NEIGHBOURS
         if done >= 0 and keyframes.is_keyframe[done]:
             yield fuse_keyframe(done, kept, keyframes, rectifier)
@@ -232,12 +234,12 @@ def fuse_keyframe(
 
     Args:
         number: of the keyframe.
-        views: by their numbers, rectified left images and views; those around the keyframe that there are.
+        views: by their numbers, pictures and views; those around the keyframe that there are.
         keyframes: poses of the views.
         rectifier: for their calibration.
     """
     T_left_rectified = se3_inverse(rectifier.T_rectified_left)
-    image, view = views[number]
+    picture, view = views[number]
     with np.errstate(invalid="ignore"):
         # Fusion does not take the common part away: what is too uncertain by that part alone becomes no point.
         hopeless = SHARED * view.measured.variance > (_MAX_SIGMA * view.measured.disparity) ** 2
@@ -251,13 +253,20 @@ def fuse_keyframe(
         others.append((views[other][1], pose, turn_covariance(rectifier.T_rectified_left, covariance)))
     return KeyframeDepth(
         number,
-        image,
+        picture,
         view.measured,
-        fuse_depth(image, reference, others, rectifier.rectified),
+        fuse_depth(view.image.astype(np.uint8), reference, others, rectifier.rectified),
         keyframes.poses[number] @ T_left_rectified,
         turn_covariance(rectifier.T_rectified_left, keyframes.covariances[number]),
         float(keyframes.disparity_offset_sigma[number]),
     )
+
+
+def make_picture(left: np.ndarray, colour: np.ndarray | None, rectifier: StereoRectifier) -> np.ndarray:
+    """(H, W, 3) uint8 red, green and blue of a rectified left image (H, W), from its colours as they are stored."""
+    if colour is None:
+        return cv2.cvtColor(left, cv2.COLOR_GRAY2RGB)
+    return cv2.cvtColor(rectifier.rectify_left(colour), cv2.COLOR_BGR2RGB)
 
 
 def measure_view(
@@ -305,6 +314,6 @@ def _check_writable(path: Path | None) -> None:
 
 def _add_to_report(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
     """Leaves an even selection of the points, and the summary, in the run's folder and writes its report anew."""
-    write_dense_points(run / DENSE_NAME, points.points, points.sigma, points.intensity)
+    write_dense_points(run / DENSE_NAME, points.points, points.sigma, points.colours)
     atomic_write_text(run / RECONSTRUCTION_NAME, json.dumps(asdict(summary), indent=2) + "\n")
     write_report(run)

@@ -58,7 +58,7 @@ def build_scene(run: RecordedRun, most: int = MAX_POSES, start: float | None = N
         **_points(run),
     }
     if run.dense is not None:
-        scene |= {"dense": run.dense.points, "dense_grey": run.dense.intensity}
+        scene |= {"dense": run.dense.points, "dense_colours": run.dense.colours}
     others = {
         name: line.positions for name, line in (("final", run.final), ("refined", run.refined)) if line is not None
     }
@@ -83,7 +83,7 @@ def _points(run: RecordedRun) -> dict[str, Any]:
     if run.map is None:
         return {"points": np.zeros((0, 3)), "point_sigma": np.zeros(0), "point_grey": None}
     shown = _even(len(run.map.points), MAX_POINTS)
-    grey = run.map.intensity[shown]
+    grey = run.map.colours[shown]
     known = np.isfinite(grey).all()
     return {
         "points": _placed_points(run)[shown],

@@ -284,13 +284,15 @@ class _Rows:
                 self.count += 1
             self.skipped += 1
 
-    def add(self, result: Estimate | ObjectEstimate, seen: MatchedFrame | None, read_ms: float) -> None:
+    def add(
+        self, result: Estimate | ObjectEstimate, seen: MatchedFrame | None, colour: np.ndarray | None, read_ms: float
+    ) -> None:
         """Takes what was said of a frame."""
         if self._is_new(result.camera.timestamp):
             covariances = result.pose_covariance, result.pose_matching_covariance
             self._writer.add(result.camera, result.pose, *covariances, read_ms)
             for listener in self._listeners:
-                listener(TrackedFrame(self.count, result, seen))
+                listener(TrackedFrame(self.count, result, seen, colour))
             self.count += 1
 
     def check_first(self, result: Estimate | ObjectEstimate) -> None:
@@ -317,7 +319,7 @@ def _track(frames: Iterator[StereoFrame], steps: _FrameSteps, rows: _Rows, pictu
             result = steps.step(frame)
             if done == 1:
                 rows.check_first(result)
-            rows.add(result, tracker.last_frame, read_ms)
+            rows.add(result, tracker.last_frame, frame.colour, read_ms)
             if tracker.last_frame is not None:
                 pictures.add(result.camera, tracker.last_frame)
             lost += result.status == "lost"

@@ -67,7 +67,7 @@ def draw_points(
 
 
 def draw_run(run: Path) -> np.ndarray:
-    """The cloud of a reconstructed run from two viewpoints: in its grey values, and by the sigma of its points."""
+    """The cloud of a reconstructed run from two viewpoints: in its colours, and by the sigma of its points."""
     cloud = read_dense_points(run / DENSE_NAME)
     poses = read_tum(run / "trajectory.tum").poses
     halfway = poses[len(poses) // 2]
@@ -77,7 +77,6 @@ def draw_run(run: Path) -> np.ndarray:
     # The summary's voxel is the space between the points of the whole cloud, of which this is a selection.
     summary = json.loads((run / RECONSTRUCTION_NAME).read_text(encoding="utf-8"))
     spacing = summary["voxel"] * np.sqrt(summary["points"] / len(cloud.points))
-    grey = np.repeat(np.clip(cloud.intensity, 0, 255).astype(np.uint8)[:, None], 3, axis=1)
     logarithm = np.log(cloud.sigma)
     low, high = np.percentile(logarithm, (2, 98))
     level = (255.0 * np.clip((logarithm - low) / max(high - low, 1e-9), 0.0, 1.0)).astype(np.uint8)
@@ -88,7 +87,11 @@ def draw_run(run: Path) -> np.ndarray:
         orbit[:3, :3] = rotation_exp(np.array([0.0, yaw, 0.0])) @ rotation_exp(np.array([pitch, 0.0, 0.0]))
         orbit[:3, 3] = middle - farther * orbit[:3, :3] @ middle
         view = se3_inverse(halfway @ orbit)
-        rows.append(np.hstack([draw_points(cloud.points, each, view, focal, spacing) for each in (grey, by_sigma)]))
+        rows.append(
+            np.hstack(
+                [draw_points(cloud.points, each, view, focal, spacing) for each in (cloud.colours[:, ::-1], by_sigma)]
+            )
+        )
     return np.vstack(rows)
 
 

@@ -126,13 +126,11 @@ function ellipsoids(scene) {
   return group;
 }
 
-// Points of surfaces, in the grey values of the images.
+// Points of surfaces, in the colours of the images.
 function surfaces(scene) {
   const cloud = new THREE.BufferGeometry();
-  const colours = new Uint8Array(scene.dense.length);
-  for (let k = 0; k < colours.length; k++) colours[k] = scene.dense_grey[Math.floor(k / 3)];
   cloud.setAttribute("position", new THREE.BufferAttribute(scene.dense, 3));
-  cloud.setAttribute("color", new THREE.BufferAttribute(colours, 3, true));
+  cloud.setAttribute("color", new THREE.BufferAttribute(scene.dense_colours, 3, true));
   const size = scene.size / 400;
   return new THREE.Points(cloud, new THREE.PointsMaterial({ size, vertexColors: true }));
 }

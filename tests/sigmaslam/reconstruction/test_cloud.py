@@ -19,7 +19,7 @@ def test_covariances_of_points_are_those_of_drawn_poses_and_disparities():
     rng = np.random.default_rng(1)
     pose = se3_exp(np.array([1.0, -2.0, 0.5, 0.3, -0.2, 0.1]))
     root = 1e-3 * rng.standard_normal((6, 6))
-    pixel = DepthPixels(np.array([[400, 100]]), np.array([12.0]), np.array([0.01]), np.array([90], np.uint8))
+    pixel = DepthPixels(np.array([[400, 100]]), np.array([12.0]), np.array([0.01]), np.full((1, 3), 90, np.uint8))
     cloud = pixel.cloud(CAMERA, pose, root @ root.T)
     count = 40_000
     pixels = pixel.pixels + rng.uniform(-0.5, 0.5, (count, 2))
@@ -45,7 +45,8 @@ def test_closed_forms_of_three_by_three_matrices_are_those_of_the_library():
 
 def _points(points: list[list[float]], variances: list[float]) -> DenseCloud:
     six = np.array([[each, 0, 0, each, 0, each] for each in variances], np.float32)
-    return DenseCloud(np.array(points), six, np.full(len(points), 100.0, np.float32), np.ones(len(points), np.int32))
+    colours = np.outer(np.arange(len(points)) % 50, [1, 2, 5]).astype(np.float32)
+    return DenseCloud(np.array(points), six, colours, np.ones(len(points), np.int32))
 
 
 def _add(voxels: VoxelCloud, cloud: DenseCloud) -> None:
@@ -112,7 +113,7 @@ def test_a_voxel_keeps_the_most_certain_pixel_of_a_keyframe():
         np.array([[320, 240], [321, 240], [500, 240]]),
         np.array([12.0, 12.0, 12.0]),
         np.array([0.04, 0.01, 0.09]),
-        np.zeros(3, np.uint8),
+        np.zeros((3, 3), np.uint8),
     )
     kept = pixels.thinned(CAMERA, 0.5)
     assert sorted(kept.variance.tolist()) == [0.01, 0.09]
@@ -122,7 +123,9 @@ def test_compiled_thinning_is_that_of_numpy(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("sigmaslam.reconstruction._depths", reason="installed without a compiler")
     rng = np.random.default_rng(0)
     places, disparity = rng.integers(0, 480, (4000, 2)), rng.uniform(2.0, 60.0, 4000)
-    pixels = DepthPixels(places, disparity, rng.choice([0.01, 0.04, 1.0], 4000), np.zeros(4000, np.uint8))
+    pixels = DepthPixels(
+        places, disparity, rng.choice([0.01, 0.04, 1.0], 4000), rng.integers(0, 256, (4000, 3)).astype(np.uint8)
+    )
     compiled = pixels.thinned(CAMERA, 0.3)
     monkeypatch.setattr(cloud, "kernels", None)
     for one, another in zip(compiled.columns(), pixels.thinned(CAMERA, 0.3).columns(), strict=True):
@@ -155,6 +158,7 @@ def test_the_file_holds_every_number(tmp_path: Path):
     vertices = np.frombuffer(body, [(name, kinds[kind]) for _, kind, name in lines])
     assert vertices["y"].tolist() == [2.0, 5.0]
     assert vertices["sigma"].tolist() == [0.5, 2.0]
+    assert [vertices[name].tolist() for name in ("red", "green", "blue")] == [[0, 1], [0, 2], [0, 5]]
     assert vertices["covariance_yy"].tolist() == [0.25, 4.0]
     assert vertices["covariance_xy"].tolist() == [0.0, 0.0]
 

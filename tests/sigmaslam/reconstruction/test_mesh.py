@@ -23,7 +23,7 @@ def test_a_wall_becomes_a_flat_mesh_in_the_world(tmp_path: Path):
     open3d = pytest.importorskip("open3d")
     volume = DepthVolume(0.02, CAMERA)
     pose = se3_exp(np.array([1.0, 2.0, 3.0, 0.0, 0.5, 0.0]))
-    depth, image = np.full((120, 200), 2.0, np.float32), np.full((120, 200), 90, np.uint8)
+    depth, image = np.full((120, 200), 2.0, np.float32), np.full((120, 200, 3), (90, 60, 30), np.uint8)
     depth[:, :40] = 0.0
     volume.integrate(depth, image, pose)
     volume.write(tmp_path / "mesh.ply")
@@ -33,7 +33,7 @@ def test_a_wall_becomes_a_flat_mesh_in_the_world(tmp_path: Path):
     np.testing.assert_allclose(seen[:, 2], 2.0, atol=0.01)
     # Nothing where there is no depth, but for a voxel or two.
     assert seen[:, 0].min() > (40 - 99.5) / 200 * 2.0 - 0.1
-    np.testing.assert_allclose(np.asarray(mesh.vertex_colors).mean(), 90 / 255, atol=0.01)
+    np.testing.assert_allclose(np.asarray(mesh.vertex_colors).mean(axis=0), np.array([90, 60, 30]) / 255, atol=0.01)
 
 
 def test_nothing_seen_is_no_mesh(tmp_path: Path):

@@ -23,14 +23,14 @@ POINT = np.array([0.4, 0.3, 2.0])
 def _cloud(points: np.ndarray) -> DenseCloud:
     count = len(points)
     six = np.tile(np.array([1, 0, 0, 1, 0, 1], np.float32), (count, 1))
-    return DenseCloud(points, six, np.full(count, 90, np.float32), np.ones(count, np.int32))
+    return DenseCloud(points, six, np.full((count, 3), 90, np.float32), np.ones(count, np.int32))
 
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
     images = PosedImages(tmp_path / "out", CAMERA)
-    images.add(np.full((48, 64), 7, np.uint8), np.eye(4))
-    images.add(np.full((48, 64), 9, np.uint8), POSE)
+    images.add(np.full((48, 64, 3), 7, np.uint8), np.eye(4))
+    images.add(np.full((48, 64, 3), (9, 5, 1), np.uint8), POSE)
     images.write(_cloud(transform_points(POSE, POINT[None])))
     return tmp_path / "out"
 
@@ -58,7 +58,7 @@ def test_colmap_s_model_projects_the_point_to_its_pixel(written: Path):
 def test_nerfstudio_s_transforms_project_the_point_to_its_pixel(written: Path):
     content = json.loads((written / "transforms.json").read_text())
     frame = content["frames"][1]
-    assert cv2.imread(str(written / frame["file_path"]), cv2.IMREAD_GRAYSCALE)[0, 0] == 9
+    assert cv2.imread(str(written / frame["file_path"]))[0, 0].tolist() == [1, 5, 9]
     seen = transform_points(se3_inverse(np.array(frame["transform_matrix"])), transform_points(POSE, POINT[None]))[0]
     # It looks along -z with y up.
     pixel = (

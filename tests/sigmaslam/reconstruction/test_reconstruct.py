@@ -51,7 +51,7 @@ def test_a_run_becomes_a_cloud_and_its_report_shows_it(tracked: Path):
     assert len(dense.points) == summary["points"]
     assert read_run(tracked / "run").dense is not None
     report = (tracked / "run" / "report.html").read_text()
-    assert '"dense_grey"' in report
+    assert '"dense_colours"' in report
     assert len(report) < 8_000_000
 
 
@@ -82,7 +82,7 @@ def test_a_cloud_made_while_tracking_is_near_that_of_later_and_changes_no_pose(t
     for name in ("trajectory.tum", "covariance.npy", "trajectory_final.tum"):
         assert (tmp_path / "run" / name).read_bytes() == (tracked / "run" / name).read_bytes()
     live = read_dense_points(tmp_path / "run" / "dense.npz")
-    assert '"dense_grey"' in (tmp_path / "run" / "report.html").read_text()
+    assert '"dense_colours"' in (tmp_path / "run" / "report.html").read_text()
     assert run_here("map", "reconstruct", tmp_path / "run", "--out", tmp_path / "cloud.ply").returncode == 0
     later = read_dense_points(tmp_path / "run" / "dense.npz")
     assert len(live.points) == pytest.approx(len(later.points), rel=0.2)
@@ -90,6 +90,29 @@ def test_a_cloud_made_while_tracking_is_near_that_of_later_and_changes_no_pose(t
     assert np.median(distance / live.sigma) < 0.5
     assert run_here("track", tracked / "input", "--out", tmp_path / "run", "--overwrite").returncode == 0
     assert not (tmp_path / "run" / "cloud.ply").exists()
+
+
+@pytest.mark.long
+def test_points_have_the_colours_of_the_left_images(demo_sequence: Path, tmp_path: Path):
+    def tint(k: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        blue, red = left.copy(), left.copy()
+        blue[:, left.shape[1] // 2 :] //= 2
+        red[:, : left.shape[1] // 2] //= 2
+        return cv2.merge([blue, left, red]), right
+
+    copy_frames(demo_sequence, tmp_path / "input", 6, tint)
+    run = tmp_path / "run"
+    assert run_here("track", tmp_path / "input", "--out", run, "--dense", run / "cloud.ply").returncode == 0
+    live = read_dense_points(run / "dense.npz")
+    assert run_here("map", "reconstruct", run, "--out", tmp_path / "cloud.ply").returncode == 0
+    keyframes = read_recorded_keyframes(run)
+    camera, pose = keyframes.camera.left, keyframes.poses[0]
+    for cloud in (live, read_dense_points(run / "dense.npz")):
+        seen = (cloud.points - pose[:3, 3]) @ pose[:3, :3]
+        is_left = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx < camera.width / 2
+        for rows, ratios in ((is_left, (0.5, 1.0)), (~is_left, (1.0, 0.5))):
+            red, green, blue = cloud.colours[rows].astype(float).sum(axis=0)
+            np.testing.assert_allclose((red / green, blue / green), ratios, atol=0.1)
 
 
 @pytest.mark.long
@@ -138,7 +161,7 @@ def test_voxels_have_a_size_where_the_first_keyframe_has_no_points():
     shape, nothing = (40, 60), np.full((40, 60), np.nan, np.float32)
     single = DisparityMap(np.full(shape, 8.0, np.float32), np.ones(shape, np.float32))
     fused = FusedDepth(nothing, nothing, *np.zeros((2, *shape), np.uint8), np.zeros(shape, bool))
-    depth = KeyframeDepth(0, np.zeros(shape, np.uint8), single, fused, np.eye(4), np.eye(6), 0.1)
+    depth = KeyframeDepth(0, np.zeros((*shape, 3), np.uint8), single, fused, np.eye(4), np.eye(6), 0.1)
     assert default_voxel(depth, camera) == pytest.approx(2 * 5.0 / 400.0, rel=0.02)
 
 
@@ -148,7 +171,7 @@ def test_points_at_borders_of_what_is_measured_are_left_out():
     sure, support = np.where(np.isnan(borders), np.nan, 1e-4).astype(np.float32), np.full(shape, 3, np.uint8)
     fused = FusedDepth(borders + 8.0, sure, support, np.zeros(shape, np.uint8), support > 0)
     single = DisparityMap(fused.disparity, sure)
-    depth = KeyframeDepth(0, np.zeros(shape, np.uint8), single, fused, np.eye(4), np.eye(6), 0.0)
+    depth = KeyframeDepth(0, np.zeros((*shape, 3), np.uint8), single, fused, np.eye(4), np.eye(6), 0.0)
     assert depth.is_point[8:-8, :36].all()
     assert depth.is_point[:16, 8:-8].all()
     assert not depth.is_point[25:, 39:].any()
@@ -159,8 +182,8 @@ def test_each_keyframe_s_points_are_shown_as_they_come_and_lie_on_the_cloud(trac
     shown: list[np.ndarray] = []
     sequence = open_sequence(tracked / "input")
 
-    def show(points: np.ndarray, grey: np.ndarray) -> None:
-        assert len(points) == len(grey)
+    def show(points: np.ndarray, colours: np.ndarray) -> None:
+        assert colours.shape == (len(points), 3)
         shown.append(points)
 
     sink = CloudSink(tmp_path / "cloud.ply", tmp_path / "run", sequence.camera, show)
