@@ -44,6 +44,7 @@ class Acceptance:
         streak_sharpness: of the least sharp direction, per squared pixel of half the image; stripes have more.
         noise_contrast: variance between blocks of an image by that of white noise of its pixels; scenes have more.
         stands: pixels; landmarks of a camera that stands depart by less from where they were, others by thrice that.
+        other_moment: ratio of scatters; rows fit the other eye's a frame before by so much better where an eye is late.
         changed_image: share of the variance of most of the image that has changed; from there on the scene has moved.
         least_sharpness: share of what keyframes saw; bounds by how much a blurred frame is less certain.
         usual_clustering: factor on variances; nine of ten quiet frames stay below, above it one frame is believed.
@@ -88,6 +89,7 @@ class Acceptance:
     streak_sharpness: float = 0.09
     noise_contrast: float = 2.0
     stands: float = 0.5
+    other_moment: float = 2.0
     changed_image: float = 0.1
     least_sharpness: float = 0.1
     usual_clustering: float = 2.0

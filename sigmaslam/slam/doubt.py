@@ -15,6 +15,7 @@ class Doubt(StrEnum):
     OFFSET = "offset too large"
     RIG = "rig changed"
     EYES = "eyes exchanged"
+    APART = "eyes of two moments"
     TIME = "image of another time"
     MOTIONS = "two motions"
     FIXED = "fixed in the image"

@@ -13,6 +13,8 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.slam.doubt import Doubt, Doubts
+from sigmaslam.slam.eye_timing import EyeTiming
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.frozen_images import shows_motion
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
@@ -46,18 +48,19 @@ class Scrutiny:
         self._T_rival_fit = np.eye(4)
         self._last_error, self._had_other_times = 0.0, False
         self._input_is_wrong = input_is_wrong
+        self._timing = EyeTiming()
         self._before: tuple[np.ndarray, ...] | None = None
         self._fixed_for = 0
 
-    def doubt(self, left: np.ndarray, matches: GuidedMatches, fit: FrameFit) -> tuple[GuidedMatches, FrameFit, Doubts]:
+    def doubt(self, frame: Frame, matches: GuidedMatches, fit: FrameFit) -> tuple[GuidedMatches, FrameFit, Doubts]:
         """What speaks against a pose, before motion and map learn from it, and the pose without what is found to be
         wrong: matches on what moves are left out, and a contradicted prediction becomes less certain.
 
         Args:
-            left: (H, W) uint8.
+            frame: the current one.
             matches, fit: of the image.
         """
-        doubts = Doubts()
+        doubts, left = Doubts(), frame.left
         moving = self._moving
         for region in (moving, self._rival):
             if region is not None:
@@ -75,6 +78,10 @@ class Scrutiny:
             doubts.add(Doubt.INPUT)
         for index in np.flatnonzero(self._window.exceeded).tolist():
             doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
+        seen = matches.views.select(fit.inliers)
+        ids, follows = self._window.landmarks.id[seen.landmark], self._localiser.follower.is_ready
+        if self._timing.are_apart(frame, ids, seen.measurement, follows):
+            doubts.add(Doubt.APART)
         if self._is_fixed(left, matches, fit):
             doubts.add(Doubt.FIXED)
         if matches.rival is not None:

@@ -208,7 +208,7 @@ class StereoTracker:
         self.last_frame = MatchedFrame(frame.left, frame.right, landmarks, matches, inliers, frame.usable)
         predicted = filtered = self._motion.state
         if fit is not None:
-            matches, fit, doubts = self._scrutiny.doubt(frame.left, matches, fit)
+            matches, fit, doubts = self._scrutiny.doubt(frame, matches, fit)
             status = doubts.status
             expected = self._motion.step, self._motion.step_covariance
             blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))
