@@ -74,6 +74,8 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
         "learned anew from there: calibrate again.",
         Doubt.FIXED: "From {first:.1f} s on landmarks stay in the image while others move, and draw poses along: dots "
         "of a projector (switch it off), a reflection, dirt, or the vehicle (--mask).",
+        Doubt.APART: "From {first:.1f} s on, in {frames} frames, one eye is a frame behind: it has rows that the "
+        "other one had. Trigger both cameras together, or pair the images anew: depth and poses are wrong.",
         Doubt.EYES: "From {first:.1f} s on, in {frames} frames, the left image is of the right eye: they have no pose. "
         "Does the driver number the cameras anew?",
     }

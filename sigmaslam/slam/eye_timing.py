@@ -1,4 +1,4 @@
-"""Whether both eyes show one moment, by the rows of landmarks: those of a late eye are the other's a frame before."""
+"""Whether the eyes show one moment: landmarks have rows in a late eye that they had in the other one a frame before."""
 
 from collections import deque
 
@@ -9,24 +9,24 @@ from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.rig_change import follow_to_right
 
 # Frames whose rows are compared together, as in a single one most may move alike, and the fewest landmarks in them:
-# of 30 in any frame of 13 good recordings no draw of 15,080 came near the ratio, of 15 two fell below it.
+# of 30 in one frame of 13 good recordings none of 15,080 draws came near the ratio, of 15 two fell below it.
 _FRAMES, _FEWEST = 4, 30
-# So many landmarks are followed, or up to twice as many: that takes time in each frame.
+# Landmarks that are followed to the right eye, or up to twice as many: that takes time in each frame.
 _FOLLOWED = 32
-# Frames after the eyes agree again: they have spoilt the map.
+# Frames in which the eyes must agree again, as those before have spoilt the map.
 _SPOILT = 20
 
 
 class EyeTiming:
-    """Compares the rows of both eyes in the same frame with those in successive ones."""
+    """Compares rows of the eyes in a frame with those in successive ones."""
 
     def __init__(self) -> None:
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._last = np.zeros(0, np.int64), np.zeros((0, 2))
         self._rows: deque[np.ndarray] = deque(maxlen=_FRAMES)
         self._apart_for = 0
 
     def are_apart(self, frame: Frame, landmark_id: np.ndarray, seen: np.ndarray, follows: bool) -> bool:
-        """Whether one eye was a frame behind in the last frames, or so shortly before that the map is spoilt.
+        """Whether one eye is a frame behind, or was so shortly before.
 
         Args:
             frame: the current one.
@@ -34,25 +34,24 @@ class EyeTiming:
             follows: the frame before had a pose, too.
         """
         stereo = np.isfinite(seen[:, 2])
-        # Powers of two, so that most of them are those of the frame before.
+        # A power of two, so that most of them are those of the frame before.
         share = 1 << (max(int(stereo.sum()) // _FOLLOWED, 1).bit_length() - 1)
         chosen = np.flatnonzero(stereo & (landmark_id % share == 0))
         moved, places, good = follow_to_right(frame.left, frame.right, seen[chosen])
         rows = np.column_stack([seen[:, 1], np.full(len(seen), np.nan)])
         rows[chosen[good], 1] = (places + moved)[:, 1]
-        if self._last is not None and follows:
-            _, now, then = np.intersect1d(landmark_id, self._last[0], assume_unique=True, return_indices=True)
-            (left, right), (old_left, old_right) = rows[now].T, self._last[1][then].T
-            self._rows.append(np.stack([right - left, right - old_left, old_right - left]))
+        both, now, then = np.intersect1d(landmark_id, self._last[0], assume_unique=True, return_indices=True)
+        (left, right), (old_left, old_right) = rows[now].T, self._last[1][then].T
+        self._rows.append(np.stack([right - left, right - old_left, old_right - left])[:, : follows * len(both)])
         self._last = landmark_id, rows
-        differences = np.concatenate([np.zeros((3, 0)), *self._rows], axis=1)
-        enough = np.isfinite(differences).sum(axis=1) >= _FEWEST
+        differences = np.concatenate(self._rows, axis=1)
+        enough, scatter = np.isfinite(differences).sum(axis=1) >= _FEWEST, np.full(3, np.inf)
         if enough[0]:
-            middle = np.nanmedian(differences, axis=1, keepdims=True)
-            scatter = np.nanmedian(np.abs(differences - middle), axis=1)
-            same, late, early = np.where(enough, scatter, np.inf)
+            known = differences[enough]
+            scatter[enough] = np.nanmedian(np.abs(known - np.nanmedian(known, axis=1, keepdims=True)), axis=1)
+            same, late, early = scatter
             if ACCEPTANCE.other_moment * min(late, early) < same:
-                self._apart_for = _SPOILT + 1
-            elif self._apart_for > 1 and ACCEPTANCE.other_moment * same < min(late, early):
-                self._apart_for -= 1
+                self._apart_for = _SPOILT
+            elif ACCEPTANCE.other_moment * same < min(late, early):
+                self._apart_for = max(self._apart_for - 1, 0)
         return self._apart_for > 0

@@ -77,9 +77,7 @@ class RigWatch:
         return RigChange(fit, -float(shift[0]), float(shift[1]))
 
 
-def follow_to_right(
-    left: np.ndarray, right: np.ndarray, uvd: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def follow_to_right(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(M, 2) by how much right places depart from where (u, v, disparity) (K, 3) put those on the left; these; (K,)
     bool, which of them were found.
     """

@@ -82,7 +82,7 @@ class Scrutiny:
         ids, follows = self._window.landmarks.id[seen.landmark], self._localiser.follower.is_ready
         if self._timing.are_apart(frame, ids, seen.measurement, follows):
             doubts.add(Doubt.APART)
-        if self._is_fixed(left, matches, fit):
+        elif self._is_fixed(left, matches, fit):
             doubts.add(Doubt.FIXED)
         if matches.rival is not None:
             doubts.add_motion(matches.rival, fit.pose)

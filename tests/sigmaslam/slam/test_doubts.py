@@ -257,6 +257,18 @@ def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Dem
     assert np.trace(other.covariance[:3, :3]) > 2.0 * np.trace(one.covariance[:3, :3])
 
 
+@pytest.mark.parametrize("fault", ["right_lags", "left_lags"])
+def test_an_eye_that_is_a_frame_behind_is_doubtful(demo: Demo, fault: str):
+    camera, frames, _ = demo
+    right, left = (frames[:-1], frames[1:]) if fault == "right_lags" else (frames[1:], frames[:-1])
+    tracker = StereoTracker(camera)
+    pairs = [replace(one, right=other.right) for one, other in zip(left[:FRAMES], right[:FRAMES], strict=True)]
+    estimates = track(tracker, pairs)
+    first = next(k for k, each in enumerate(estimates) if Doubt.APART in each.doubts)
+    assert first < 10
+    assert all(each.status != "tracking" for each in estimates[first:])
+
+
 def test_a_prediction_that_explains_the_image_does_not_give_way(demo: Demo):
     """What agrees with it may be the scene behind a mover that fills the view."""
     camera, frames, _ = demo

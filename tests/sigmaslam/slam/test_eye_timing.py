@@ -1,0 +1,58 @@
+"""A texture that moves up and down, seen by two eyes of one moment or of two."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmaslam.slam.eye_timing import EyeTiming
+from sigmaslam.slam.frame import Frame
+
+DISPARITY, FRAMES = 5, 40
+ROWS = np.random.default_rng(3).integers(-3, 4, FRAMES)
+"""By which the texture is lower in each frame."""
+PLACES = np.stack(np.meshgrid(np.arange(30, 180, 15), np.arange(30, 140, 15)), axis=-1).reshape(-1, 2)
+
+
+class Texture:
+    """In place of a front-end, which is not asked."""
+
+    observe = None
+
+
+def seen_apart(right_rows: np.ndarray, follows: bool = True) -> list[bool]:
+    """What is said of each frame, whose right eye shows the texture by so many rows lower."""
+    noise = np.random.default_rng(2).normal(128.0, 400.0, (170, 210))
+    texture = np.clip(cv2.GaussianBlur(noise, (0, 0), 3.0), 0, 255).astype(np.uint8)
+    timing, said = EyeTiming(), []
+    for left, right in zip(ROWS, right_rows, strict=True):
+        frame = Frame(np.roll(texture, left, 0), np.roll(texture, (right, -DISPARITY), (0, 1)), Texture)  # type: ignore[arg-type]
+        seen = np.column_stack([PLACES + (0, left), np.full(len(PLACES), float(DISPARITY))])
+        said.append(timing.are_apart(frame, np.arange(len(PLACES)), seen, follows))
+    return said
+
+
+def test_eyes_of_one_moment_are_never_apart():
+    assert not any(seen_apart(ROWS))
+
+
+@pytest.mark.parametrize("by", [1, 3, 8])
+def test_another_height_of_the_right_eye_is_no_other_moment(by: int):
+    assert not any(seen_apart(ROWS + by))
+
+
+@pytest.mark.parametrize("late", [1, -1], ids=["right", "left"])
+def test_an_eye_that_is_a_frame_behind_is_named_within_four_frames(late: int):
+    said = seen_apart(np.roll(ROWS, late))
+    assert all(said[4:])
+
+
+def test_what_a_frame_without_a_pose_was_before_is_not_compared():
+    assert not any(seen_apart(np.roll(ROWS, 1), follows=False))
+
+
+def test_eyes_that_agree_again_are_apart_as_long_as_the_map_is_spoilt():
+    rows = ROWS.copy()
+    rows[5:12] = ROWS[4:11]
+    said = seen_apart(rows)
+    assert all(said[9:31])
+    assert not any(said[:5] + said[36:])
