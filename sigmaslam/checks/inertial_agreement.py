@@ -168,14 +168,9 @@ def _judge_forces(axes: np.ndarray | None) -> Finding:
 def _judge_mounting(
     fit: TurnFit, off: np.ndarray, axes: np.ndarray | None, of_forces: np.ndarray | None, inverse: np.ndarray
 ) -> Finding:
-    """Of the rotation in T_cam_imu.
+    """Of the rotation in T_cam_imu: the sensor is turned by `off` (3, 3), or `inverse` if that were inverted.
 
-    Args:
-        fit: of the turns.
-        off: (3, 3) sensor as it is expected to sensor as it is.
-        axes: nearest to that; None where there are none.
-        of_forces: what the accelerometer has for axes; None where it is not known.
-        inverse: (3, 3) the same if T_cam_imu were inverted.
+    `axes` are nearest to that, `of_forces` the accelerometer's; None where they are not known.
     """
     right = np.linalg.det(off) > 0.0
     # A mirror is no rotation: determinant and all signs are changed first, for a number to show.

@@ -73,13 +73,8 @@ def relative_to_first(poses: PastPoses, indices: list[int]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class _Earlier:
-    """Poses of keyframes.
-
-    Attributes:
-        poses: (M, 4, 4) T_world_keyframe.
-        own: (M, 6, 6) covariances.
-        cross: (M, 6, n) covariances with the window's state.
-        common: (M, 6, 15) how considered errors of the calibration enter their errors.
+    """Poses (M, 4, 4) of keyframes, covariances, own (M, 6, 6) and with the window's state (M, 6, n), and factors of
+    the errors of the calibration in common (M, 6, 15).
     """
 
     poses: np.ndarray

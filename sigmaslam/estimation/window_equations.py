@@ -43,10 +43,7 @@ def gate_views(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarra
 def _views(
     window: KeyframeWindow, observations: KeyframeViews, rows: np.ndarray, owner: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`: views of landmarks (K,) by row.
-
-    `owner` (O,) tells which of these each of the views sees.
-    """
+    """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`, whose landmark (K,) is `owner` (O,)."""
     state, landmarks, views = window.posterior, window.landmarks, observations.views
     anchor = landmarks.anchor[views.landmark]
     pairs, pair = np.unique(anchor * len(state) + observations.keyframe, return_inverse=True)

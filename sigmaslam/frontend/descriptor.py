@@ -215,16 +215,8 @@ class DescriptorFrontend:
 
 @dataclass(frozen=True, slots=True)
 class _FollowedPatches(Table):
-    """Keypoints of keyframes in an image, before they are verified.
-
-    Attributes:
-        search: (M,) number of the keyframe's search.
-        key_index: (M,) index into the keyframe's features.
-        predicted: (M, 2) where they were expected, pixels.
-        expected_disparity: (M,) pixels.
-        sigma0: (M,) of the keypoints, pixels.
-        places: (M, 2) where they were found.
-        evidence: of the patches there.
+    """M keypoints of keyframes in an image, before they are verified: `key_index` of the keyframe of `search`, places
+    (M, 2) expected and found, with sigmas of the former, pixels.
     """
 
     search: np.ndarray

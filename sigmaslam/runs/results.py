@@ -139,11 +139,7 @@ def output_error(folder: Path, failed: list[str]) -> OutputError:
 
 
 class _Files:
-    """Files of a folder that are written one by one; one that fails costs a message and not the others.
-
-    Attributes:
-        failed: names of those that could not be written.
-    """
+    """Files of a folder that are written one by one; one that has `failed` costs a message and not the others."""
 
     def __init__(self, folder: Path) -> None:
         self.failed: list[str] = []

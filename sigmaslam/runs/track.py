@@ -252,12 +252,7 @@ def _sensors(sequence: StereoSequence, tracker: Tracker) -> list[_Samples]:
 
 
 class _Rows:
-    """Rows of frames.csv, and who is told of them; of a run that goes on none is written twice.
-
-    Attributes:
-        count: of the rows, those before a stop included.
-        skipped: frames that could not be read, so far.
-    """
+    """Rows of frames.csv, those before a stop counted, and who is told; of a run that goes on none is written twice."""
 
     def __init__(
         self,

@@ -11,10 +11,9 @@ from sigmaslam.slam.rig_change import follow_to_right
 # Frames whose rows are compared together, as in a single one most may move alike, and the fewest landmarks in them:
 # of 30 in one frame of 13 good recordings none of 15,080 draws came near the ratio, of 15 two fell below it.
 _FRAMES, _FEWEST = 4, 30
-# Landmarks that are followed to the right eye, or up to twice as many: that takes time in each frame.
-_FOLLOWED = 32
-# Frames in which the eyes must agree again, as those before have spoilt the map.
-_SPOILT = 20
+# Landmarks that are followed to the right eye, or twice as many, and frames in which the eyes must agree again, as the
+# others have spoilt the map.
+_FOLLOWED, _SPOILT = 32, 20
 
 
 class EyeTiming:
@@ -47,8 +46,8 @@ class EyeTiming:
         differences = np.concatenate(self._rows, axis=1)
         enough, scatter = np.isfinite(differences).sum(axis=1) >= _FEWEST, np.full(3, np.inf)
         if enough[0]:
-            known = differences[enough]
-            scatter[enough] = np.nanmedian(np.abs(known - np.nanmedian(known, axis=1, keepdims=True)), axis=1)
+            middle = np.nanmedian(differences[enough], axis=1, keepdims=True)
+            scatter[enough] = np.nanmedian(np.abs(differences[enough] - middle), axis=1)
             same, late, early = scatter
             if ACCEPTANCE.other_moment * min(late, early) < same:
                 self._apart_for = _SPOILT

@@ -195,11 +195,7 @@ class Mapper:
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
     def _add_landmarks(self, view: StereoView, views: LandmarkViews, blur: float) -> np.ndarray:
-        """Makes landmarks of the stereo points that no landmark has been found at, less certain where it is blurred.
-
-        Returns:
-            (K,) which of the view's features they are.
-        """
+        """Makes landmarks of features (K,) at which none has been found, less certain where the view is blurred."""
         index = np.flatnonzero(np.isfinite(view.disparity))
         taken = views.measurement[:, :2]
         scale = np.clip(np.sqrt(view.left.size / _FULL_SPACING_FROM), _LEAST_SPACING, 1.0)

@@ -166,8 +166,7 @@ class Scrutiny:
 def _without_error(window: KeyframeWindow, fit: FrameFit, index: int) -> np.ndarray:
     """(6,) spread of a pose that stands on an error of the calibration which may as well stand for something else.
 
-    A delay between the eyes, say, makes up an offset. With even odds that there is none the second moment about the
-    pose is half of the squared step between the two.
+    With even odds that there is none the second moment about the pose is half of the squared step between the two.
     """
     change = fit.calibration[index] - window.expected[index]
     return np.sqrt(0.5) * step_with(fit.joint.covariance, slice(-6, None), index, change)

@@ -153,10 +153,7 @@ def find_scene_behind(
 
 
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:
-    """(M,) bool, as much of the image (M cells) as some of `others` (K,) explain that depart (K pixels) in the median.
-
-    Those are at most all that depart and, with them, as many that do not: of these the ones that explain the most.
-    """
+    """(M,) bool, of `others` (K,) those that depart (K pixels), and as many that do not, which stand for most cells."""
     share = 1.0 / np.bincount(cells)[cells[others]]
     same = are_one_place(departs)
     order = np.lexsort((-share, same))

@@ -158,13 +158,8 @@ def _starts(
 
 @dataclass(frozen=True, slots=True)
 class _Residuals:
-    """Whitened residuals (M,) of matches at a pose, and derivatives (M, 5) by rotation and direction.
-
-    Attributes:
-        residual, J: across the epipolar lines (Sampson).
-        behind, J_behind: along them, of matches that would have to be moved to infinity; else 0.
-        parallax: (M,) distance from where a point at infinity would be, in the units of the rays.
-        tangent: (3, 2) directions in which the direction may move.
+    """Whitened residuals (M,) at a pose and derivatives (M, 5), across epipolar lines (Sampson), and along them of what
+    lies behind infinity; distances (M,) from infinity; and (3, 2) how the direction may move.
     """
 
     residual: np.ndarray
@@ -254,14 +249,8 @@ def _refine(
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """A refined pose.
-
-    Attributes:
-        R, direction: the pose.
-        cost: twice its negative log-likelihood.
-        inliers: (M,) bool.
-        scale: variance of their residuals, 1 or more: matches are not taken to be better than they say.
-        covariance: (5, 5) of rotation and angles of the direction.
+    """A refined pose, twice its negative log-likelihood, inliers (M,), variance of their residuals, 1 or more as these
+    are no better than they say, and covariance (5, 5) of rotation and angles of the direction.
     """
 
     R: np.ndarray
@@ -290,10 +279,7 @@ def _fit_places(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pose of points on the plane normal . X = distance (over the baseline's length) by both coordinates in image 1.
 
-    Of rotation, angles of the direction and normal those that are free move; the normal starts at 0, a mere turn.
-
-    Returns:
-        Rotation, direction, squared errors (M,) in standard deviations, information of what is free.
+    What is free of rotation, direction and normal moves; last come squared errors (M,), and the information of that.
     """
     normal, inverse = np.zeros(3), np.linalg.inv(rays.spread1 + rays.spread0)
     for turn in range(_WIDE_STEPS + _STEPS):

@@ -15,13 +15,7 @@ from sigmaslam.two_view.stereo_pose import MIN_POINTS, RelativePose, estimate_re
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """A pose that explains a part of the matches.
-
-    Attributes:
-        pose: with inliers among all matches.
-        area: share of the image that they stand for: of each cell the share of its own matches.
-        disparity: median of them, pixels.
-    """
+    """A pose, the share of the image that its inliers stand for, and their median disparity, pixels."""
 
     pose: RelativePose
     area: float

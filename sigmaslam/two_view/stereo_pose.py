@@ -233,10 +233,7 @@ class _StereoMatches:
 def _project(
     camera: RectifiedStereo, landmarks: np.ndarray, T_camera_key: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where landmarks (M, 3) of a keyframe are seen, (M, 3), and whether in front of the camera (M,).
-
-    And the derivatives by a perturbation of T from the left (M, 3, 6) and by the landmark (M, 3, 3).
-    """
+    """Where landmarks (M, 3) are seen, and whether in front (M,); derivatives by T from the left, and by landmarks."""
     focal = camera.focal_baseline
     # Points are scaled by inverse depth, so that points at infinity are regular.
     rays = camera.rays(landmarks[:, :2])

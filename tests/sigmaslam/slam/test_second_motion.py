@@ -48,6 +48,12 @@ def test_matches_that_stay_where_they_are_bound_nothing_else_in() -> None:
     assert not _most_departing(np.zeros(12, np.int64), np.arange(9), np.full(9, 1.0)).any()
 
 
+def black() -> Any:
+    """A frame that shows nothing."""
+    image = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    return SimpleNamespace(left=image, right=image)
+
+
 def scene(seed: int, way: list[float], sigma: float = 0.2) -> tuple[Localiser, GuidedMatches, FrameFit]:
     """Matches of a scene and of a body before it that has gone some way, metres, and the pose by all of them.
 
@@ -67,7 +73,8 @@ def scene(seed: int, way: list[float], sigma: float = 0.2) -> tuple[Localiser, G
     motion = MotionFilter()
     motion.step_covariance[:] = np.diag(np.repeat([sigma, 0.5 * sigma], 3) ** 2)
     config: Any = SimpleNamespace(min_inliers=15)
-    given: list[Any] = [window, motion, FrameUpdate(window, ITERATIONS), None, None, None, config, None]
+    follower = SimpleNamespace(is_ready=False)
+    given: list[Any] = [window, motion, FrameUpdate(window, ITERATIONS), None, follower, None, config, None]
     localiser, matches = Localiser(*given), GuidedMatches(views, np.ones(count), np.arange(count))
     fit = localiser.update.fit(views, np.eye(4), motion.step_covariance, 15)
     assert fit is not None
@@ -107,8 +114,7 @@ def test_far_parts_do_not_side_with_a_prediction_that_the_image_contradicts(seed
 def test_a_body_that_moves_by_too_little_to_be_told_is_in_the_covariance(seed: int) -> None:
     """A pixel: nothing is left out, and the pose that the body draws along stays the frame's."""
     localiser, matches, fit = scene(seed, [-0.004, 0.0, 0.0])
-    image = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-    kept, same, doubts = Scrutiny(localiser, FrameClock(), MovingRegion(8.0, 10), False).doubt(image, matches, fit)
+    kept, same, doubts = Scrutiny(localiser, FrameClock(), MovingRegion(8.0, 10), False).doubt(black(), matches, fit)
     assert kept is matches
     assert same is fit
     error = se3_log(POSE @ se3_inverse(fit.pose))
@@ -118,10 +124,10 @@ def test_a_body_that_moves_by_too_little_to_be_told_is_in_the_covariance(seed: i
 
 def test_a_pose_that_a_body_draws_far_along_is_as_uncertain_as_the_others_know_it() -> None:
     """And it spoils a keyframe: its error would be in all later poses. Two pixels; of one the step says enough."""
-    image, moving = np.zeros((CAMERA.height, CAMERA.width), np.uint8), MovingRegion(8.0, 10)
+    moving = MovingRegion(8.0, 10)
     for way, spoils, most in ((-0.008, True, 2.0), (-0.004, False, 8.0)):
         localiser, matches, fit = scene(2, [way, 0.0, 0.0])
-        _, same, doubts = Scrutiny(localiser, FrameClock(), moving, False).doubt(image, matches, fit)
+        _, same, doubts = Scrutiny(localiser, FrameClock(), moving, False).doubt(black(), matches, fit)
         assert same is fit
         assert doubts.spoils_keyframe == spoils
         assert doubts.status == "tracking"
