@@ -75,6 +75,8 @@ class UnguidedMatcher:
             return None
         index = np.flatnonzero(key.disparity >= MIN_DISPARITY)
         measured = self.window.as_calibrated(key.measured(index))
+        ahead = measured[:, 2] > 0.0  # a wrong offset moves others behind infinity
+        index, measured = index[ahead], measured[ahead]
         errors = self.window.posterior.whole_covariance[CALIBRATION, CALIBRATION]
         sigma, first = self._sigmas(key, index), first.with_shared_errors(errors)
         predicted, covariance, inside = foresee(self.camera, measured, sigma, first)

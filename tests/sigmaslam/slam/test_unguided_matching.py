@@ -95,6 +95,16 @@ def test_repeated_texture_is_no_place_where_the_other_landmarks_are_missing(shar
     assert (matcher.confirmed_pose_to(key, key) is not None) == is_found
 
 
+def test_landmarks_that_an_offset_moves_behind_infinity_are_left_out():
+    key = key_view(1)
+    matcher = matcher_of(Sights(key, np.eye(4), some(COUNT), np.ones(COUNT, bool)))
+    matcher.window.as_calibrated = lambda measured: measured - (0.0, 0.0, 6.0)  # type: ignore[method-assign]
+    assert (key.disparity < 6.0).any()
+    found = matcher.confirmed_pose_to(key, key)
+    assert found is not None
+    assert found.foreseen <= (key.disparity > 6.0).sum()
+
+
 def test_few_landmarks_suffice_where_none_can_look_alike():
     """From so much nearer a keyframe's landmarks look different, and a right pose finds a few of them."""
     key, pose = key_view(2, 6.0), se3_exp(np.array([0.0, 0.0, 1.6, 0.0, 0.0, 0.0]))
