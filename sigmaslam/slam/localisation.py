@@ -230,10 +230,7 @@ class Localiser:
     def _fit_alone(
         self, matches: GuidedMatches, near: GuidedMatches, prediction: Prediction, start: np.ndarray, scale: float
     ) -> FrameFit | None:
-        """The pose of what was found around `start` (4, 4), by a prediction as uncertain as it asks for.
-
-        None where what agrees with the prediction itself explains a rival's part of the image.
-        """
+        """The pose of what was found around `start` (4, 4), by a prediction as uncertain; None where that has a rival."""
         excess = surprise(self.motion, se3_inverse(self.window.posterior.poses[-1]) @ start)
         pose, covariance, least = prediction.pose, prediction.covariance, self.config.min_inliers
         fit = self.update.fit(matches.views, pose, excess * covariance, least, start, scale)
