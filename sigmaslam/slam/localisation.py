@@ -230,7 +230,7 @@ class Localiser:
     def _fit_alone(
         self, matches: GuidedMatches, near: GuidedMatches, prediction: Prediction, start: np.ndarray, scale: float
     ) -> FrameFit | None:
-        """The pose of what was found around `start` (4, 4), by a prediction as uncertain; None where that has a rival."""
+        """The pose of what was found around `start` (4, 4), by so uncertain a prediction; None if that has a rival."""
         excess = surprise(self.motion, se3_inverse(self.window.posterior.poses[-1]) @ start)
         pose, covariance, least = prediction.pose, prediction.covariance, self.config.min_inliers
         fit = self.update.fit(matches.views, pose, excess * covariance, least, start, scale)
