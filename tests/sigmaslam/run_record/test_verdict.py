@@ -68,8 +68,9 @@ def test_a_large_offset_is_named_however_uncertain_its_scale_makes_it():
     )
 
 
-def test_landmarks_that_stay_in_the_image_have_a_cure():
-    assert "--mask" in doubts_verdict({"doubts": {Doubt.FIXED: {"frames": 3, "first": 1.0}}})[0]
+@pytest.mark.parametrize(("doubt", "cure"), [(Doubt.FIXED, "--mask"), (Doubt.APART, "Trigger both cameras together")])
+def test_what_stays_in_the_image_and_an_eye_that_is_late_have_a_cure(doubt: Doubt, cure: str):
+    assert cure in doubts_verdict({"doubts": {doubt: {"frames": 3, "first": 1.0}}})[0]
 
 
 @pytest.mark.parametrize(("frames", "points"), [(3, 1000), (100, 22)])
