@@ -23,6 +23,8 @@ _FIELDS = 0.35
 # Differences of neighbouring lines over those of every other one: 0.56 to 0.69 in seven recordings, 0.98 in noise of 25
 # grey values, 1.3 to 22 where fields are interlaced, 2.5 to 23 where the pixels of a line have colours in turn.
 MAX_ALTERNATION = 1.15
+# So many frames are looked at, then one in so many: a camera shows its fields whenever it moves.
+_LOOKED_AT = 8
 # Cells that are compared, down and across, and two sides of blocks in them, pixels.
 _CELLS, _SIDES = (6, 8), (2, 8)
 
@@ -32,12 +34,14 @@ class LastPairs:
 
     def __init__(self) -> None:
         self._pairs: deque[tuple[_Probed, _Probed]] = deque(maxlen=_REMEMBERED)
-        self._was_old = self._is_interlaced = False
+        self._was_old, self._is_interlaced, self._frames = False, False, 0
 
     def of_one_moment(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Copies of images (H, W) uint8: even rows and what is between them once both are seen to be interlaced."""
         pair = np.array(left), np.array(right)
-        self._is_interlaced = self._is_interlaced or all(map(_shows_fields, pair))
+        if not self._is_interlaced and (self._frames < _LOOKED_AT or self._frames % _LOOKED_AT == 0):
+            self._is_interlaced = all(map(_shows_fields, pair))
+        self._frames += 1
         for image in pair if self._is_interlaced else ():
             image[1:-1:2] = 0.5 * image[:-2:2] + 0.5 * image[2::2] + 0.5
         return pair
