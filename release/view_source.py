@@ -1,4 +1,4 @@
-"""What the estimator's graphs do for each view, as C++ from the same modules: `sigmaslam/estimation/views.inc`.
+"""What the estimator's graphs do for each view or sigma point, as C++ from the same modules: `sigmaslam/estimation/views.inc`.
 
 A view is traced with two poses alone, those that its landmark is anchored to and that see it, so the state has 27
 numbers: of the calibration and of both poses. `estimator.cpp` puts them where they belong in the whole state.
@@ -13,7 +13,9 @@ from torch import Tensor
 from release.item_source import write_functions
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE
+from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3
 from sigmaslam_models.estimator.frame_update import NOISE_SCALE_RULES, ROBUST_SCALES, FrameViews, linearised, predicted
+from sigmaslam_models.estimator.pose_prediction import moved_pose, process_noise
 from sigmaslam_models.estimator.window_solution import WindowViews, agreeing, whitened
 
 SIZE = CALIBRATION_SIZE + 12
@@ -36,6 +38,8 @@ def write_views() -> str:
             ),
             write_functions("predict", _predicted_view, _numbers(_FRAME), _numbers(_OWN)),
             write_functions("frame", _linearised_view, _numbers(_FRAME), _numbers((*_OWN, "moved", *_SEEN))),
+            write_functions("moved", _moved_pose, _numbers(_MOTION), _numbers(("state",))),
+            write_functions("arrive", _arrived, _numbers((*_MOTION, "densities", "mean")), {}),
             write_functions("window", _window_view, _numbers((*_WINDOW, "freedom")), _numbers((*_OWN, *_SEEN))),
         ]
     )
@@ -45,11 +49,13 @@ _WINDOW = ("intrinsics", "depth", "unscented", "poses", "calibration", "spread")
 _FRAME = (*_WINDOW, "offset")
 _OWN = ("estimate", "covariance", "common")
 _SEEN = ("measurement", "noise")
+_MOTION = ("pose", "twist", "step")
 _SHAPES: dict[str, tuple[int, ...]] = {
     **{"intrinsics": (5,), "depth": (), "unscented": (), "freedom": (), "poses": (2, 4, 4)},
     **{"calibration": (CALIBRATION_SIZE,), "spread": (SIZE, SIZE), "offset": (SIZE,), "common": (3, 2)},
     **{"estimate": (LANDMARK_SIZE,), "covariance": (LANDMARK_SIZE, LANDMARK_SIZE), "moved": (LANDMARK_SIZE,)},
-    **{"measurement": (3,), "noise": (3, 3)},
+    **{"measurement": (3,), "noise": (3, 3), "pose": (4, 4), "twist": (6,), "step": (), "state": (12,)},
+    **{"densities": (2,), "mean": (6,)},
 }
 
 
@@ -86,6 +92,16 @@ def _window_view(*given: Tensor) -> tuple[Tensor, ...]:
     scene = (intrinsics, depth, unscented, anchor, anchor + 1, anchor, common)
     window = WindowViews(*scene, anchor, estimate, covariance, poses, calibration, spread, measurement, noise)
     return *whitened(window, freedom), agreeing(window).to(torch.float64)
+
+
+def _moved_pose(pose: Tensor, twist: Tensor, step: Tensor, state: Tensor) -> tuple[Tensor, ...]:
+    back = invert_se3(pose @ exp_se3(twist * step))
+    return (moved_pose(pose, twist, step, back, state[None]),)
+
+
+def _arrived(pose: Tensor, twist: Tensor, step: Tensor, densities: Tensor, mean: Tensor) -> tuple[Tensor, ...]:
+    predicted = pose @ exp_se3(twist * step)
+    return exp_se3(mean) @ predicted, process_noise(predicted, step, densities)
 
 
 if __name__ == "__main__":

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.estimation.estimator_graphs import open_step
 from sigmaslam.estimation.sample_buffer import SampleBuffer
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_inverse, se3_log
-from sigmaslam.inference.backends import load_step
 
 # Order of the graph's error state, see sigmaslam_models.estimator.pose_prediction.
 _POSE, _TWIST, _STATE_SIZE = slice(0, 6), slice(6, 12), 12
@@ -49,7 +49,7 @@ class MotionFilter:
     """Status of frames that a sensor carries, while one predicts."""
 
     def __init__(self, backend: str = "onnx") -> None:
-        self._predict = load_step("pose_predict", backend)
+        self._predict = open_step("pose_predict", backend)
         self.step = np.eye(4)
         self.twist = np.zeros(6)
         self._covariance = np.zeros((_STATE_SIZE, _STATE_SIZE))

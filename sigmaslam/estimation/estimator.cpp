@@ -14,6 +14,9 @@ namespace {
 // Errors of the calibration in the state; with both poses what a view says something of.
 constexpr int CALIBRATION = 15, VIEW_TURNS = 3, PART = CALIBRATION + 12;
 
+constexpr int MOTION = 12;                  // pose and twist
+constexpr double PIVOT_TOLERANCE = 1e-13;  // of `plain_factors`
+
 // Rows and columns are filled up with zeros to multiples of eight.
 struct Matrix {
     int rows = 0, width = 0;
@@ -253,6 +256,20 @@ py::list window_gate(const py::dict& given) {
     return results;
 }
 
+py::list pose_predict(const py::dict& given) {
+    Feed feed(given);
+    double motion[7 + 16], covariance[MOTION][MOTION];
+    std::copy_n(feed.numbers("twist"), 6, std::copy_n(feed.numbers("pose"), 16, motion));
+    motion[22] = feed.number("step");
+    std::copy_n(feed.numbers("covariance"), MOTION * MOTION, covariance[0]);
+    Reals pose({4, 4}), spread({MOTION, MOTION});
+    (HAS_AVX2 ? wide::predict_motion : plain::predict_motion)(motion, covariance, feed.numbers("densities"),
+                                                              pose.mutable_data(), spread.mutable_data());
+    py::list results;
+    results.append(pose), results.append(spread);
+    return results;
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_estimator, module) {
@@ -266,6 +283,7 @@ PYBIND11_MODULE(_estimator, module) {
     module.def("frame_predict", &frame_predict);
     module.def("frame_robust", &frame_robust);
     module.def("frame_gated", &frame_gated);
+    module.def("pose_predict", &pose_predict);
     module.def("window_eliminate", &window_eliminate);
     module.def("window_gate", &window_gate);
 }

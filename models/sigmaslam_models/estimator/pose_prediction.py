@@ -36,16 +36,21 @@ class Predict(nn.Module):
         back = invert_se3(predicted)
 
         def moved(offsets: Tensor) -> Tensor:
-            after = exp_se3(offsets[:, POSE]) @ pose @ exp_se3((twist + offsets[:, TWIST]) * step)
-            return torch.cat([log_se3(after @ back), offsets[:, TWIST]], dim=-1)
+            return torch.cat([moved_pose(pose, twist, step, back, offsets), offsets[:, TWIST]], dim=-1)
 
         with ExactOperators():
             state = Unscented(cubature())(moved, cholesky(covariance)[0], None)
             mean, spread = state.mean, state.columns.covariance()
-        return exp_se3(mean[POSE]) @ predicted, spread + _process_noise(predicted, step, densities)
+        return exp_se3(mean[POSE]) @ predicted, spread + process_noise(predicted, step, densities)
 
 
-def _process_noise(pose: Tensor, step: Tensor, densities: Tensor) -> Tensor:
+def moved_pose(pose: Tensor, twist: Tensor, step: Tensor, back: Tensor, offsets: Tensor) -> Tensor:
+    """(K, 6) where states with offsets (K, 12) end, from a pose whose inverse (4, 4) is `back`."""
+    after = exp_se3(offsets[:, POSE]) @ pose @ exp_se3((twist + offsets[:, TWIST]) * step)
+    return log_se3(after @ back)
+
+
+def process_noise(pose: Tensor, step: Tensor, densities: Tensor) -> Tensor:
     """White acceleration over one step, (12, 12): the exact integral, turned from the body frame into the reference."""
     six = torch.cat([densities[0].expand(3), densities[1].expand(3)])
     body = torch.eye(6, dtype=pose.dtype, device=pose.device) * six
