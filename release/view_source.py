@@ -13,8 +13,10 @@ from torch import Tensor
 from release.item_source import write_functions
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE, LANDMARK_SIZE
-from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3
+from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3
 from sigmaslam_models.estimator.frame_update import NOISE_SCALE_RULES, ROBUST_SCALES, FrameViews, linearised, predicted
+from sigmaslam_models.estimator.inertial_prediction import STATE_SIZE as INERTIAL_SIZE
+from sigmaslam_models.estimator.inertial_prediction import moved_by_sensor, sensor_noise
 from sigmaslam_models.estimator.pose_prediction import moved_pose, process_noise
 from sigmaslam_models.estimator.window_solution import WindowViews, agreeing, whitened
 
@@ -40,6 +42,8 @@ def write_views() -> str:
             write_functions("frame", _linearised_view, _numbers(_FRAME), _numbers((*_OWN, "moved", *_SEEN))),
             write_functions("moved", _moved_pose, _numbers(_MOTION), _numbers(("state",))),
             write_functions("arrive", _arrived, _numbers((*_MOTION, "densities", "mean")), {}),
+            write_functions("sensed", _sensed_pose, _numbers(_SENSED), _numbers(("point",))),
+            write_functions("settle", _settled, _numbers((*_SENSED, *_SETTLED)), {}),
             write_functions("window", _window_view, _numbers((*_WINDOW, "freedom")), _numbers((*_OWN, *_SEEN))),
         ]
     )
@@ -50,12 +54,16 @@ _FRAME = (*_WINDOW, "offset")
 _OWN = ("estimate", "covariance", "common")
 _SEEN = ("measurement", "noise")
 _MOTION = ("pose", "twist", "step")
+_SENSED = ("pose", "velocity", "gravity", "mounting", "step", "turn", "gained", "moved_by", "slope")
+_SETTLED = ("covered", "walk", "change")
 _SHAPES: dict[str, tuple[int, ...]] = {
     **{"intrinsics": (5,), "depth": (), "unscented": (), "freedom": (), "poses": (2, 4, 4)},
     **{"calibration": (CALIBRATION_SIZE,), "spread": (SIZE, SIZE), "offset": (SIZE,), "common": (3, 2)},
     **{"estimate": (LANDMARK_SIZE,), "covariance": (LANDMARK_SIZE, LANDMARK_SIZE), "moved": (LANDMARK_SIZE,)},
     **{"measurement": (3,), "noise": (3, 3), "pose": (4, 4), "twist": (6,), "step": (), "state": (12,)},
-    **{"densities": (2,), "mean": (6,)},
+    **{"densities": (2,), "mean": (6,), "mounting": (4, 4), "turn": (3, 3), "slope": (9, 25), "covered": (9, 9)},
+    **{"walk": (2,), "change": (9,), "point": (INERTIAL_SIZE,)},
+    **dict.fromkeys(("velocity", "gravity", "gained", "moved_by"), (3,)),
 }
 
 
@@ -102,6 +110,21 @@ def _moved_pose(pose: Tensor, twist: Tensor, step: Tensor, state: Tensor) -> tup
 def _arrived(pose: Tensor, twist: Tensor, step: Tensor, densities: Tensor, mean: Tensor) -> tuple[Tensor, ...]:
     predicted = pose @ exp_se3(twist * step)
     return exp_se3(mean) @ predicted, process_noise(predicted, step, densities)
+
+
+def _sensed_pose(*given: Tensor) -> tuple[Tensor, ...]:
+    motion, point = given[:9], given[9][None]
+    camera, velocity, _ = moved_by_sensor(*motion, point)
+    predicted, speed, _ = moved_by_sensor(*motion, torch.zeros_like(point))
+    return log_se3(camera @ invert_se3(predicted)), velocity - speed
+
+
+def _settled(*given: Tensor) -> tuple[Tensor, ...]:
+    motion, noise, walk, change = given[:9], *given[9:]
+    camera, velocity, body = moved_by_sensor(*motion, torch.zeros(1, INERTIAL_SIZE, dtype=torch.float64))
+    start = motion[0] @ motion[3]
+    added = sensor_noise(start[:3, :3], body[0], noise, walk * motion[4])
+    return exp_se3(change[:6]) @ camera[0], velocity[0] + change[6:], added
 
 
 if __name__ == "__main__":

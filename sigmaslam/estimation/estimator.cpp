@@ -14,7 +14,7 @@ namespace {
 // Errors of the calibration in the state; with both poses what a view says something of.
 constexpr int CALIBRATION = 15, VIEW_TURNS = 3, PART = CALIBRATION + 12;
 
-constexpr int MOTION = 12;                  // pose and twist
+constexpr int MOTION = 12, SENSED = 43;     // pose and twist; with an inertial sensor
 constexpr double PIVOT_TOLERANCE = 1e-13;  // of `plain_factors`
 
 // Rows and columns are filled up with zeros to multiples of eight.
@@ -270,6 +270,45 @@ py::list pose_predict(const py::dict& given) {
     return results;
 }
 
+py::list inertial_predict(const py::dict& given) {
+    Feed feed(given);
+    std::vector<double> motion(279 + 81 + 2);
+    double* to = motion.data();
+    const std::initializer_list<std::pair<const char*, int>> parts = {
+        {"pose", 16}, {"velocity", 3},        {"gravity", 3},         {"mounting", 16}, {"seconds", 1}, {"turn", 9},
+        {"velocity_change", 3}, {"position_change", 3}, {"slope", 225}, {"noise", 81},    {"walk", 2}};
+    for (const auto& [name, count] : parts) to = std::copy_n(feed.numbers(name), count, to);
+    const Matrix root = feed.matrix("root");
+    Matrix spread(root.width, root.width), carried = spread;
+    Reals pose({4, 4}), velocity(3);
+    (HAS_AVX2 ? wide::predict_sensed : plain::predict_sensed)(motion.data(), root, pose.mutable_data(),
+                                                              velocity.mutable_data(), spread, carried);
+    py::list results;
+    results.append(pose), results.append(velocity);
+    results.append(array(spread, SENSED, SENSED)), results.append(array(carried, SENSED, SENSED));
+    return results;
+}
+
+py::list window_condition(const py::dict& given) {
+    Feed feed(given);
+    const Matrix factor = feed.matrix("factor"), information = feed.matrix("information"), common = feed.matrix("common");
+    const int size = factor.rows, columns = feed.length("common", 1);
+    const double* vector = feed.numbers("vector");
+    Matrix learned(size, 1 + columns), moved = learned;
+    for (int i = 0; i < size; ++i) {
+        learned.at(i)[0] = vector[i];
+        std::copy_n(common.at(i), columns, learned.at(i) + 1);
+    }
+    const Matrix covariance = (HAS_AVX2 ? wide::condition : plain::condition)(factor, information, learned, moved);
+    for (int i = 0; i < size; ++i)
+        for (int j = 0; j < columns; ++j) moved.at(i)[1 + j] += common.at(i)[j];
+    py::list results;
+    results.append(column(moved, size, 0));
+    results.append(array(covariance, size, size));
+    results.append(array(moved, size, columns, 1));
+    return results;
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_estimator, module) {
@@ -284,6 +323,8 @@ PYBIND11_MODULE(_estimator, module) {
     module.def("frame_robust", &frame_robust);
     module.def("frame_gated", &frame_gated);
     module.def("pose_predict", &pose_predict);
+    module.def("inertial_predict", &inertial_predict);
+    module.def("window_condition", &window_condition);
     module.def("window_eliminate", &window_eliminate);
     module.def("window_gate", &window_gate);
 }

@@ -33,7 +33,7 @@ class EstimatorGraphs:
         self.is_compiled = self.gated_step is getattr(_compiled, "frame_gated", None)
         self.eliminate_landmarks = open_step("window_eliminate", backend)
         self.gate_window = open_step("window_gate", backend)
-        self.condition = load_step("window_condition", backend)
+        self.condition = open_step("window_condition", backend)
         self._intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.focal_baseline])
         self._unscented = np.array(float(unscented))
 

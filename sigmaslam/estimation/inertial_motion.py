@@ -15,7 +15,7 @@ from sigmaslam.estimation.standstill import WHILE, Standstill, find_blow
 from sigmaslam.estimation.wheel_speed import WheelSpeed
 from sigmaslam.geometry.inertial_sensor import InertialSensor
 from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_exp, se3_inverse, se3_log, skew
-from sigmaslam.inference.backends import load_step
+from sigmaslam.estimation.estimator_graphs import open_step
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class InertialMotion(MotionFilter):
         self, backend: str, sensor: InertialSensor, T_camera_imu: np.ndarray, wheels: WheelSpeed | None = None
     ) -> None:
         super().__init__(backend)
-        self._predict_inertial = load_step("inertial_predict", backend)
+        self._predict_inertial = open_step("inertial_predict", backend)
         self.samples, self.noise, self._T_camera_imu = InertialBuffer(sensor), LearnedNoise(), T_camera_imu
         self._wheels, self._contradictions, self._mounting = wheels, 0, T_camera_imu
         self.sensors = {"imu": self.samples} | ({} if wheels is None else {"odometry": wheels.samples})

@@ -52,30 +52,47 @@ class InertialPredict(nn.Module):
         # One evaluation of all points, the centre last: a graph spends its time on operators, not on their rows.
         with ExactOperators():
             points = cubature().offsets(root, with_centre=True)
-            change = points[:, BIASES_TO_FACTORS] @ slope.transpose(0, 1)
-            turned = torch.cat([torch.zeros_like(change[:, :3]), change[:, :3]], dim=-1)
-            offset, mount, turned = exp_se3(torch.stack([points[:, POSE], points[:, MOUNTING], turned]))
-            mount = mount @ mounting
-            body = offset @ pose @ mount
-            R, p = body[:, :3, :3], body[:, :3, 3]
-            v, g = velocity + points[:, VELOCITY], gravity + points[:, GRAVITY]
-            gained = (R @ (velocity_change + change[:, 3:6]).unsqueeze(-1)).squeeze(-1)
-            moved = (R @ (position_change + change[:, 6:]).unsqueeze(-1)).squeeze(-1)
-            place = p + v * seconds + g * (seconds * seconds * 0.5) + moved
-            top = torch.cat([R @ turn @ turned[:, :3, :3], place.unsqueeze(-1)], dim=-1)
-            body = torch.cat([top, body[:, 3:]], dim=-2)
-            camera, v = body @ invert_se3(mount), v + g * seconds + gained
+            motion = seconds, turn, velocity_change, position_change, slope
+            camera, v, body = moved_by_sensor(pose, velocity, gravity, mounting, *motion, points)
             predicted, speed = camera[-1], v[-1]
             local = torch.cat([log_se3(camera @ invert_se3(predicted)), v - speed, points[:, 9:]], dim=-1)[:-1]
             mean = cubature().mean(local, STATE_SIZE, with_centre=False)
             columns = cubature().deviations(local, mean, STATE_SIZE, with_centre=False)
             spread, carried = columns.covariance(), root @ columns.odd.transpose(0, 1)
         start = pose @ mounting
-        added = _process_noise(start[:3, :3], body[-1], noise, walk * seconds)
+        added = sensor_noise(start[:3, :3], body[-1], noise, walk * seconds)
         return exp_se3(mean[POSE]) @ predicted, speed + mean[VELOCITY], spread + added, carried
 
 
-def _process_noise(R: Tensor, body: Tensor, noise: Tensor, walk: Tensor) -> Tensor:
+def moved_by_sensor(
+    pose: Tensor,
+    velocity: Tensor,
+    gravity: Tensor,
+    mounting: Tensor,
+    seconds: Tensor,
+    turn: Tensor,
+    velocity_change: Tensor,
+    position_change: Tensor,
+    slope: Tensor,
+    points: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where states with offsets (K, 43) end: poses (K, 4, 4), velocities (K, 3), and poses of the sensor."""
+    change = points[:, BIASES_TO_FACTORS] @ slope.transpose(0, 1)
+    turned = torch.cat([torch.zeros_like(change[:, :3]), change[:, :3]], dim=-1)
+    offset, mount, turned = exp_se3(torch.stack([points[:, POSE], points[:, MOUNTING], turned]))
+    mount = mount @ mounting
+    body = offset @ pose @ mount
+    R, p = body[:, :3, :3], body[:, :3, 3]
+    v, g = velocity + points[:, VELOCITY], gravity + points[:, GRAVITY]
+    gained = (R @ (velocity_change + change[:, 3:6]).unsqueeze(-1)).squeeze(-1)
+    moved = (R @ (position_change + change[:, 6:]).unsqueeze(-1)).squeeze(-1)
+    place = p + v * seconds + g * (seconds * seconds * 0.5) + moved
+    top = torch.cat([R @ turn @ turned[:, :3, :3], place.unsqueeze(-1)], dim=-1)
+    body = torch.cat([top, body[:, 3:]], dim=-2)
+    return body @ invert_se3(mount), v + g * seconds + gained, body
+
+
+def sensor_noise(R: Tensor, body: Tensor, noise: Tensor, walk: Tensor) -> Tensor:
     """(43, 43) of noise in the sensor's frames: turns from the right at the end, the others at the start."""
     zero = torch.zeros_like(R)
     turned = body[:3, :3]

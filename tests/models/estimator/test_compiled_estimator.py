@@ -17,6 +17,7 @@ from sigmaslam_models.estimator.graph_examples import frame_example, window_exam
 
 FRAME_STEPS = ("frame_predict", "frame_robust", "frame_gated")
 WINDOW_STEPS = ("window_eliminate", "window_gate")
+OTHER_STEPS = ("pose_predict", "inertial_predict", "window_condition")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,6 +54,24 @@ def test_compiled_step_equals_torch(name, unscented, tolerance, inputs):
         for a, b in zip(found, expected, strict=True):
             assert (a.shape, a.dtype) == (b.shape, b.dtype)
             np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * max(1.0, float(np.abs(b).max())))
+
+
+@pytest.mark.parametrize("name", OTHER_STEPS)
+def test_compiled_prediction_and_condition_equal_torch(name):
+    module = traced_modules()[name]
+    for values in (module.traced, module.checked):
+        feed = {key: value.numpy() for key, value in zip(module.inputs, values, strict=True)}
+        for a, b in zip(open_step(name)(feed), open_step(name, "torch")(feed), strict=True):
+            assert (a.shape, a.dtype) == (b.shape, b.dtype)
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * float(np.abs(b).max()))
+
+
+def test_pose_that_is_known_exactly_is_predicted():
+    module = traced_modules()["pose_predict"]
+    feed = {key: value.numpy().copy() for key, value in zip(module.inputs, module.traced, strict=True)}
+    feed["covariance"][:6] = feed["covariance"][:, :6] = 0.0
+    for a, b in zip(open_step("pose_predict")(feed), open_step("pose_predict", "torch")(feed), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", [*FRAME_STEPS, *WINDOW_STEPS])
