@@ -1,4 +1,4 @@
-"""What the estimator's graphs do for each view or sigma point, as C++ from the same modules: `sigmaslam/estimation/views.inc`.
+"""Views and sigma points of the estimator's graphs as C++ from the same modules: `sigmaslam/estimation/views.inc`.
 
 A view is traced with two poses alone, those that its landmark is anchored to and that see it, so the state has 27
 numbers: of the calibration and of both poses. `estimator.cpp` puts them where they belong in the whole state.

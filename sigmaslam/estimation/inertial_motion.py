@@ -6,6 +6,7 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.constant_velocity import MotionFilter, MotionState
+from sigmaslam.estimation.estimator_graphs import open_step
 from sigmaslam.estimation.gaussian import at_most, matrix_root, regression
 from sigmaslam.estimation.inertial_alignment import GravitySearch
 from sigmaslam.estimation.inertial_buffer import InertialBuffer, LearnedNoise
@@ -15,7 +16,6 @@ from sigmaslam.estimation.standstill import WHILE, Standstill, find_blow
 from sigmaslam.estimation.wheel_speed import WheelSpeed
 from sigmaslam.geometry.inertial_sensor import InertialSensor
 from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_exp, se3_inverse, se3_log, skew
-from sigmaslam.estimation.estimator_graphs import open_step
 
 _LOGGER = logging.getLogger(__name__)
 
