@@ -17,7 +17,7 @@ from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se
 from sigmaslam_models.estimator.frame_update import NOISE_SCALE_RULES, ROBUST_SCALES, FrameViews, linearised, predicted
 from sigmaslam_models.estimator.inertial_prediction import STATE_SIZE as INERTIAL_SIZE
 from sigmaslam_models.estimator.inertial_prediction import moved_by_sensor, sensor_noise
-from sigmaslam_models.estimator.pose_prediction import moved_pose, process_noise
+from sigmaslam_models.estimator.pose_prediction import moved_state, process_noise
 from sigmaslam_models.estimator.window_solution import WindowViews, agreeing, whitened
 
 SIZE = CALIBRATION_SIZE + 12
@@ -104,7 +104,7 @@ def _window_view(*given: Tensor) -> tuple[Tensor, ...]:
 
 def _moved_pose(pose: Tensor, twist: Tensor, step: Tensor, state: Tensor) -> tuple[Tensor, ...]:
     back = invert_se3(pose @ exp_se3(twist * step))
-    return (moved_pose(pose, twist, step, back, state[None]),)
+    return (moved_state(pose, twist, step, back, state[None])[:, :6],)
 
 
 def _arrived(pose: Tensor, twist: Tensor, step: Tensor, densities: Tensor, mean: Tensor) -> tuple[Tensor, ...]:
@@ -114,14 +114,14 @@ def _arrived(pose: Tensor, twist: Tensor, step: Tensor, densities: Tensor, mean:
 
 def _sensed_pose(*given: Tensor) -> tuple[Tensor, ...]:
     motion, point = given[:9], given[9][None]
-    camera, velocity, _ = moved_by_sensor(*motion, point)
-    predicted, speed, _ = moved_by_sensor(*motion, torch.zeros_like(point))
+    camera, velocity, _ = moved_by_sensor(motion, point)
+    predicted, speed, _ = moved_by_sensor(motion, torch.zeros_like(point))
     return log_se3(camera @ invert_se3(predicted)), velocity - speed
 
 
 def _settled(*given: Tensor) -> tuple[Tensor, ...]:
     motion, noise, walk, change = given[:9], *given[9:]
-    camera, velocity, body = moved_by_sensor(*motion, torch.zeros(1, INERTIAL_SIZE, dtype=torch.float64))
+    camera, velocity, body = moved_by_sensor(motion, torch.zeros(1, INERTIAL_SIZE, dtype=torch.float64))
     start = motion[0] @ motion[3]
     added = sensor_noise(start[:3, :3], body[0], noise, walk * motion[4])
     return exp_se3(change[:6]) @ camera[0], velocity[0] + change[6:], added

@@ -161,18 +161,8 @@ def compare_with_neighbours(
 
 
 def _align(image0: Images, image1: np.ndarray, targets: PatchTargets, start: np.ndarray) -> AlignedPatches:
-    return align_patches(
-        image0,
-        image1,
-        targets.points,
-        start,
-        targets.maps.A,
-        targets.maps.tilt,
-        radius=_RADIUS,
-        iterations=_ITERATIONS,
-        taper=_TAPER,
-        source=targets.source,
-    )
+    points, source = (targets.points, start, targets.maps.A, targets.maps.tilt), targets.source
+    return align_patches(image0, image1, *points, radius=_RADIUS, iterations=_ITERATIONS, taper=_TAPER, source=source)
 
 
 def _coarse_to_fine(small0: tuple[Images, ...], small1: tuple[np.ndarray, ...], targets: PatchTargets) -> np.ndarray:

@@ -126,15 +126,6 @@ def _align(
     image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, shifted: Refinement, maps: PatchMaps
 ) -> Refinement:
     """From where patches that are only shifted agree to where the warped ones do."""
-    aligned = align_patches(
-        image0,
-        image1,
-        points0.astype(np.float64),
-        shifted.places,
-        maps.A,
-        maps.tilt,
-        radius=_RADIUS,
-        iterations=_ITERATIONS,
-        taper=_TAPER,
-    )
+    points = points0.astype(np.float64), shifted.places, maps.A, maps.tilt
+    aligned = align_patches(image0, image1, *points, radius=_RADIUS, iterations=_ITERATIONS, taper=_TAPER)
     return Refinement(shifted.start, aligned.places, aligned.moved | shifted.moved, maps.A)

@@ -10,6 +10,8 @@ State (error coordinates in this order):
   mounting  6  T_camera_imu, left perturbation
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -33,50 +35,28 @@ class InertialPredict(nn.Module):
         float64. The root may be singular: a graph takes 3 ms for one of its own.
     """
 
-    def forward(
-        self,
-        pose: Tensor,
-        velocity: Tensor,
-        gravity: Tensor,
-        mounting: Tensor,
-        root: Tensor,
-        seconds: Tensor,
-        turn: Tensor,
-        velocity_change: Tensor,
-        position_change: Tensor,
-        slope: Tensor,
-        noise: Tensor,
-        walk: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, *given: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sigma points through the motion; noise is added after."""
+        (*start, root), motion, (noise, walk) = given[:5], given[5:10], given[10:]
         # One evaluation of all points, the centre last: a graph spends its time on operators, not on their rows.
         with ExactOperators():
             points = cubature().offsets(root, with_centre=True)
-            motion = seconds, turn, velocity_change, position_change, slope
-            camera, v, body = moved_by_sensor(pose, velocity, gravity, mounting, *motion, points)
+            camera, v, body = moved_by_sensor((*start, *motion), points)
             predicted, speed = camera[-1], v[-1]
             local = torch.cat([log_se3(camera @ invert_se3(predicted)), v - speed, points[:, 9:]], dim=-1)[:-1]
             mean = cubature().mean(local, STATE_SIZE, with_centre=False)
             columns = cubature().deviations(local, mean, STATE_SIZE, with_centre=False)
             spread, carried = columns.covariance(), root @ columns.odd.transpose(0, 1)
-        start = pose @ mounting
-        added = sensor_noise(start[:3, :3], body[-1], noise, walk * seconds)
+        added = sensor_noise((start[0] @ start[3])[:3, :3], body[-1], noise, walk * motion[0])
         return exp_se3(mean[POSE]) @ predicted, speed + mean[VELOCITY], spread + added, carried
 
 
-def moved_by_sensor(
-    pose: Tensor,
-    velocity: Tensor,
-    gravity: Tensor,
-    mounting: Tensor,
-    seconds: Tensor,
-    turn: Tensor,
-    velocity_change: Tensor,
-    position_change: Tensor,
-    slope: Tensor,
-    points: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Where states with offsets (K, 43) end: poses (K, 4, 4), velocities (K, 3), and poses of the sensor."""
+def moved_by_sensor(motion: Sequence[Tensor], points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where states with offsets (K, 43) end by what all have in common, the module's arguments but for root and noises.
+
+    Poses (K, 4, 4), velocities (K, 3), and poses of the sensor.
+    """
+    pose, velocity, gravity, mounting, seconds, turn, velocity_change, position_change, slope = motion
     change = points[:, BIASES_TO_FACTORS] @ slope.transpose(0, 1)
     turned = torch.cat([torch.zeros_like(change[:, :3]), change[:, :3]], dim=-1)
     offset, mount, turned = exp_se3(torch.stack([points[:, POSE], points[:, MOUNTING], turned]))

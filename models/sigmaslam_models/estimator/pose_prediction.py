@@ -5,6 +5,8 @@ State (error coordinates in this order):
   twist  6  constant velocity of the camera in its own frame, m/s and rad/s
 """
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 
@@ -33,21 +35,17 @@ class Predict(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Sigma points through T Exp(twist dt); noise is added after."""
         predicted = pose @ exp_se3(twist * step)
-        back = invert_se3(predicted)
-
-        def moved(offsets: Tensor) -> Tensor:
-            return torch.cat([moved_pose(pose, twist, step, back, offsets), offsets[:, TWIST]], dim=-1)
-
+        moved = partial(moved_state, pose, twist, step, invert_se3(predicted))
         with ExactOperators():
             state = Unscented(cubature())(moved, cholesky(covariance)[0], None)
             mean, spread = state.mean, state.columns.covariance()
         return exp_se3(mean[POSE]) @ predicted, spread + process_noise(predicted, step, densities)
 
 
-def moved_pose(pose: Tensor, twist: Tensor, step: Tensor, back: Tensor, offsets: Tensor) -> Tensor:
-    """(K, 6) where states with offsets (K, 12) end, from a pose whose inverse (4, 4) is `back`."""
+def moved_state(pose: Tensor, twist: Tensor, step: Tensor, back: Tensor, offsets: Tensor) -> Tensor:
+    """Offsets (K, 12) after the step, from a pose whose inverse (4, 4) is `back`."""
     after = exp_se3(offsets[:, POSE]) @ pose @ exp_se3((twist + offsets[:, TWIST]) * step)
-    return log_se3(after @ back)
+    return torch.cat([log_se3(after @ back), offsets[:, TWIST]], dim=-1)
 
 
 def process_noise(pose: Tensor, step: Tensor, densities: Tensor) -> Tensor:
