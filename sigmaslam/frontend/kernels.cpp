@@ -397,6 +397,35 @@ py::array_t<double> fit_slopes(const Reals& points, const Reals& disparities, co
     return result;
 }
 
+// Ascending numbers of those centres (N, 2) that, by order (N,), lie on no disc about what is taken (K, 2) or came before.
+py::array_t<int64_t> select_spaced(int height, int width, const Grey& disc, const Steps& taken, const Steps& centres,
+                                   const Steps& order) {
+    const Image stamp = view(disc);
+    const py::ssize_t count = centres.size() / 2;
+    if (height < 1 || width < 1 || order.size() != count) throw std::invalid_argument("an order has a row for each point");
+    std::vector<uint8_t> occupied(static_cast<size_t>(height) * width);
+    const auto occupy = [&](const int32_t* at) {
+        const int left = at[0] - stamp.width / 2, top = at[1] - stamp.height / 2;
+        for (int v = std::max(top, 0); v < std::min(top + stamp.height, height); ++v)
+            for (int u = std::max(left, 0); u < std::min(left + stamp.width, width); ++u)
+                occupied[static_cast<size_t>(v) * width + u] |= stamp.pixels[(v - top) * stamp.width + u - left];
+    };
+    for (py::ssize_t k = 0; k < taken.size() / 2; ++k) occupy(taken.data() + 2 * k);
+    std::vector<int64_t> kept;
+    for (py::ssize_t k = 0; k < count; ++k) {
+        const int32_t number = order.data()[k];
+        if (number < 0 || number >= count) throw std::invalid_argument("there is no point of that number");
+        const int32_t* at = centres.data() + 2 * number;
+        if (occupied[static_cast<size_t>(clamp(at[1], height - 1)) * width + clamp(at[0], width - 1)]) continue;
+        kept.push_back(number);
+        occupy(at);
+    }
+    std::sort(kept.begin(), kept.end());
+    py::array_t<int64_t> result(kept.size());
+    std::copy(kept.begin(), kept.end(), result.mutable_data());
+    return result;
+}
+
 // Inverse of the part of a symmetric matrix whose rows are measured; the rest of it is zero. False where it is singular.
 bool invert_measured(const double (&matrix)[3][3], const bool* measured, double (&inverse)[3][3]) {
     double m[3][3];
@@ -490,6 +519,7 @@ PYBIND11_MODULE(_kernels, module) {
     module.def("energies", &energies);
     module.def("derivative_products", &derivative_products);
     module.def("fit_slopes", &fit_slopes);
+    module.def("select_spaced", &select_spaced);
     module.def("stereo_equations", &stereo_equations);
     module.def("neighbour_medians", &neighbour_medians);
 }

@@ -1,7 +1,7 @@
 """Patches of grey images, aligned and compared: compiled where a compiler was at hand, in NumPy else.
 
 Other compiled functions stand beside their twins: `motion_blur`, `image_sharpness`, `followed_patches`,
-`plane_alignment`, `row_search` and `two_view.stereo_pose`.
+`plane_alignment`, `row_search`, `feature_spacing` and `two_view.stereo_pose`.
 
 Both compute the same formula, so that results agree to rounding. Samples come straight from the 8-bit image by a
 separable Gaussian, whose weights are tabulated by the fraction of a pixel: exact at every place, where bilinear samples
