@@ -19,7 +19,6 @@ constexpr int MOST_OCTAVES = 6;  // half octaves of smoothing, 0 to 5
 constexpr int MOST_TAPS = 32;
 constexpr int MOST_EXTENT = 128;  // pixels that a patch reaches over
 constexpr double MOST_ZOOM = 25.0, LEAST_CORRELATION = 0.5;  // of areas; of patches that fit
-constexpr double SHORTEST = 0.01;  // step of an alignment, samples, after which no other is worth while
 constexpr float FLAT = 1e-2f, RIDGE = 1e-6f, NEAREST = 0.2f;
 
 struct Image {

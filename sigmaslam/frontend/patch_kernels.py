@@ -33,8 +33,6 @@ MAX_HALF_OCTAVES = 5
 _MIN_DEPTH = 0.2
 # Variance of grey values that is added to a patch's before it is normalised, and to the normal equations.
 _FLAT, _RIDGE = np.float32(1e-2), np.float32(1e-6)
-# A step of an alignment, samples, after which no other is worth while: what is left is a tenth of the noise.
-_SHORTEST = 0.01
 # Patches that are sampled at once.
 _CHUNK = 128
 
@@ -82,7 +80,7 @@ def align(
         tilt: (M, 2) its perspective part, as of `PatchMaps`.
         half_octaves: (M,) log2 of the zoom of image 1 over image 0, doubled and rounded.
         radius: of the patches, samples.
-        iterations: Gauss-Newton steps, each at most one sample long; none after one of less than 0.01 samples.
+        iterations: Gauss-Newton steps, each at most one sample long.
         taper: standard deviation of the patches' Gaussian window, radii.
         source: by its name; (M,) which of the images 0 each match comes from; None: there is one.
     Returns:
@@ -100,15 +98,15 @@ def align(
         weighted = gradient * window
         normal = weighted @ gradient.transpose(0, 2, 1) + _RIDGE * np.eye(2, dtype=np.float32)
         towards = np.linalg.inv(normal) @ weighted
-        shift, on = np.zeros((len(rows), 2)), np.ones((len(rows), 1), bool)
-        for left in range(iterations, -1, -1):
-            patch = _normalised(sample(image1, (points1[rows] + shift)[:, None] + grid, max(step, 0)), window)
-            result[rows, 2] = np.where(on[:, 0], (patch * template) @ window, result[rows, 2])
-            move = (towards @ (patch - template)[..., None])[..., 0].astype(np.float64) * on * (left > 0)
+        shift = np.zeros((len(rows), 2))
+        for _ in range(iterations):
+            patch = sample(image1, (points1[rows] + shift)[:, None] + grid, max(step, 0))
+            error = _normalised(patch, window) - template
+            move = (towards @ error[..., None])[..., 0].astype(np.float64)
             length = np.linalg.norm(move, axis=1, keepdims=True)
             shift -= move * np.minimum(1.0, spacing / np.maximum(length, 1e-9))
-            on &= length >= _SHORTEST * spacing
-        result[rows, :2] = shift
+        patch = _normalised(sample(image1, (points1[rows] + shift)[:, None] + grid, max(step, 0)), window)
+        result[rows, :2], result[rows, 2] = shift, (patch * template) @ window
     return result
 
 
