@@ -22,8 +22,8 @@ INFIX = {
     "ne": "!=", "bitwise_and": "&", "bitwise_or": "|", "bitwise_xor": "^",
 }  # fmt: skip
 # Operations that only move numbers are done by torch itself, on the numbers' places in the program.
-_MOVES = "expand slice select unsqueeze squeeze squeeze_ permute split_with_sizes diagonal clone cat index_select alias \
-copy_ unbind stack flip gather index repeat t transpose as_strided copy slice_scatter select_scatter"
+_MOVES = "expand slice select unsqueeze squeeze squeeze_ permute split_with_sizes diagonal clone cat index_select \
+alias copy_ unbind stack flip gather index repeat t transpose as_strided copy slice_scatter select_scatter"
 _LOGIC = {"logical_not": "bitwise_not", "logical_and": "bitwise_and", "logical_or": "bitwise_or",
           "logical_xor": "bitwise_xor"}  # fmt: skip
 _REDUCED = {"sum": "add", "mean": "add", "amax": "maximum", "amin": "minimum", "any": "bitwise_or",
