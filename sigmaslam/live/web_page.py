@@ -1,6 +1,7 @@
 """A run as a web page while it goes on, read-only: picture, path, pose and verdict for those without a viewer."""
 
 import json
+import socket
 import threading
 import time
 from collections import Counter, deque
@@ -39,7 +40,7 @@ class WebPageSink:
     """Serves a page over the newest frame; nothing is drawn while nobody looks.
 
     Args:
-        address: `PORT` of this machine alone, or `HOST:PORT`; port 0 takes a free one.
+        address: `PORT` of this machine alone, `HOST:PORT` or `[::1]:PORT`; port 0 takes a free one.
         camera: of the raw images.
         judge: of the calibration.
 
@@ -54,18 +55,18 @@ class WebPageSink:
 
     def __init__(self, address: str, camera: StereoCamera, judge: Judge) -> None:
         host, _, port = address.rpartition(":")
-        host = host or "127.0.0.1"
+        host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"
         if not port.isascii() or not port.isdigit() or int(port) > 65535:
-            raise InputError(f"--serve {address}: is no address; give a PORT as 8000, or HOST:PORT")
+            raise InputError(f"--serve {address}: is no address; give a PORT as 8000, HOST:PORT or [::1]:PORT")
         try:
             # A page of another site that names itself as this machine must not read the pictures.
-            handler = partial(_Handler, self._answer, _HERE if host in _HERE else None)
-            self._server = ThreadingHTTPServer((host, int(port)), handler)
+            handler = partial(_Handler, self._answer, _HERE | {host} if host in (*_HERE, "::1") else None)
+            self._server = (_ServerOfVersion6 if ":" in host else ThreadingHTTPServer)((host, int(port)), handler)
         except OSError as error:
             raise InputError(
                 f"--serve {address}: {error.strerror}; give another HOST or PORT; port 0 is a free one"
             ) from None
-        self.url = f"http://{host}:{self._server.server_port}/"
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.server_port}/"
         self._painter, self._judge = FramePainter(camera), judge
         self._lock = threading.Lock()
         self._frame: TrackedFrame | None = None
@@ -118,6 +119,10 @@ class WebPageSink:
             _, encoded = cv2.imencode(".jpg", self._painter.draw(), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
             self._picture = encoded.tobytes()
         return self._picture
+
+
+class _ServerOfVersion6(ThreadingHTTPServer):
+    address_family = socket.AF_INET6
 
 
 class _Handler(BaseHTTPRequestHandler):

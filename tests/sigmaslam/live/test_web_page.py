@@ -141,7 +141,25 @@ def test_the_page_asks_nobody_else_and_has_what_its_script_names():
     assert {"status", "image", "plan", "facts", "verdict"} <= names
 
 
-@pytest.mark.parametrize("address", ["", "here", "127.0.0.1:", "70000", "8000:here", "-1", "256.0.0.1:8000"])
+@pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6")
+@pytest.mark.parametrize(
+    ("address", "host", "guest"),
+    [("[::1]:0", "[::1]", 403), ("::1:0", "[::1]", 403), ("[::]:0", "[::]", 200), (":::0", "[::]", 200)],
+)
+def test_a_page_is_at_an_address_of_version_6(camera: StereoCamera, address: str, host: str, guest: int):
+    page = WebPageSink(address, camera, judge)
+    try:
+        assert page.url.startswith(f"http://{host}:")
+        assert state_of(page) == {"frame": None}
+        assert ask(page, "/state.json", host="localhost")[0].status == 200
+        assert ask(page, "/state.json", host="evil.example")[0].status == guest
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize(
+    "address", ["", "here", "127.0.0.1:", "70000", "8000:here", "-1", "256.0.0.1:8000", "::", "::1"]
+)
 def test_what_is_no_address_is_refused(camera: StereoCamera, address: str):
     with pytest.raises(InputError, match="--serve"):
         WebPageSink(address, camera, judge)
