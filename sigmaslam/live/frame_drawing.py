@@ -266,8 +266,8 @@ def extent(path: np.ndarray, points: np.ndarray, centre: np.ndarray, far: float)
 def format_length(metres: float) -> str:
     """A length with the unit that makes it readable."""
     if metres < 0.01:
-        return f"{1e3 * metres:.2g} mm"
-    return f"{100 * metres:.2g} cm" if metres < 1.0 else f"{metres:.1f} m"
+        return f"{1e3 * metres:.3g} mm"
+    return f"{100 * metres:.3g} cm" if metres < 1.0 else f"{float(f'{metres:.3g}'):g} m"
 
 
 def _draw_legend(picture: np.ndarray) -> None:

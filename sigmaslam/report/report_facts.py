@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.checks.finding import Finding, wrong
+from sigmaslam.live.frame_drawing import format_length
 from sigmaslam.report.report_plots import frame_interval, nis_per_dof
 from sigmaslam.run_record.frame_table import RECKONED, STATUSES, TRACKED
 from sigmaslam.run_record.real_time import format_latency
@@ -40,13 +41,8 @@ def judge(run: RecordedRun) -> State:
     if ended != "complete":
         notices.append(("warn", f"The run did not come to its end: {ended}."))
     if lost and tracked:
-        share = 100 * lost / len(run.frames)
-        notices.append(
-            (
-                "warn",
-                f"Tracking was lost in {lost} frames ({share:.1f} %): poses there are predicted by the motion alone.",
-            )
-        )
+        share = f"{lost} frames ({100 * lost / len(run.frames):.1f} %)"
+        notices.append(("warn", f"Tracking was lost in {share}: poses there are predicted by the motion alone."))
     notices += [("warn", each) for each in doubts_verdict(run.summary)]
     findings = wrong([Finding(**each) for each in (*run.entries.get("checks", ()), *run.summary.get("imu", ()))])
     notices += [("warn", f"{each.name}: {each.message}") for each in findings if each.message not in (failure or "")]
@@ -74,10 +70,10 @@ def list_facts(run: RecordedRun) -> Facts:
     ]
     position, rotation = run.sigmas
     if len(position) and np.isfinite(position[-1]):
-        facts.append(("sigma at the end", f"{_length(position[-1])}, {np.degrees(rotation[-1]):.2g}°"))
+        facts.append(("sigma at the end", f"{format_length(position[-1])}, {np.degrees(rotation[-1]):.2g}°"))
     drift, turn = (_median(each) for each in run.sigmas_over_a_second)
     if drift is not None and turn is not None:
-        facts.append(("sigma over a second", f"{_length(drift)}, {np.degrees(turn):.2g}°"))
+        facts.append(("sigma over a second", f"{format_length(drift)}, {np.degrees(turn):.2g}°"))
     facts += _errors(run)
     keyframes, inliers = frames.columns["keyframe"], frames.columns["inliers"]
     if np.isfinite(keyframes).any():
@@ -105,8 +101,10 @@ def list_calibration(run: RecordedRun) -> list[tuple[str, str, str]]:
     rows = []
     if len(known) and len(run.trajectory):
         rows.append(("disparity offset [px]", f"{offset[known[-1]]:+.3f}", f"{sigma[known[-1]]:.3f}"))
-    errors = run.summary.get("calibration_errors") or {}
-    return rows + [(name.replace("_", " "), f"{value:+.5g}", f"{sigma:.2g}") for name, (value, sigma) in errors.items()]
+    for name, (value, sigma) in (run.summary.get("calibration_errors") or {}).items():
+        unit = "" if name in ("focal", "baseline") else " [px at 45°]"
+        rows.append((name.replace("_", " ") + unit, f"{value:+.5g}", f"{sigma:.2g}"))
+    return rows
 
 
 def list_inertial(run: RecordedRun) -> Facts:
@@ -127,7 +125,7 @@ def _dark_stretches(run: RecordedRun) -> list[str]:
     order = np.argsort(edges[:, 0] - edges[:, 1], kind="stable")[:8]
     return [
         f"{last - first} frames from {run.frames.seconds[first]:.2f} s to {run.frames.seconds[last - 1]:.2f} s, in the "
-        f"end known to {_length(position[last - 1])} and {np.degrees(rotation[last - 1]):.2g}°"
+        f"end known to {format_length(position[last - 1])} and {np.degrees(rotation[last - 1]):.2g}°"
         for first, last in edges[order].tolist()
     ]
 
@@ -192,7 +190,7 @@ def list_refinement(run: RecordedRun) -> Facts:
 def _errors(run: RecordedRun) -> Facts:
     if not run.evaluation:
         return []
-    facts = [("ATE, best alignment", _length(run.evaluation["ate"]["rmse"]))]
+    facts = [("ATE, best alignment", format_length(run.evaluation["ate"]["rmse"]))]
     nees = run.evaluation.get("nees") or {}
     if nees.get("mean") is not None:
         facts.append(("NEES per dof", f"{nees['mean']:.2f}"))
@@ -219,13 +217,6 @@ def _speed(run: RecordedRun) -> Facts:
         values = np.percentile(total, (50, 95, 99))
         facts.append(("time per frame, p50, p95, p99", ", ".join(f"{value:.0f}" for value in values) + " ms"))
     return facts
-
-
-def _length(metres: float) -> str:
-    for unit, size in (("m", 1.0), ("cm", 0.01)):
-        if metres >= size:
-            return f"{metres / size:.3g} {unit}"
-    return f"{1000 * metres:.3g} mm"
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.geometry.se3 import transform_points
-from sigmaslam.live.frame_drawing import extent
+from sigmaslam.live.frame_drawing import extent, format_length
 from sigmaslam.run_record.frame_table import STATUSES
 from sigmaslam.run_record.recorded_run import RecordedRun
 
@@ -133,7 +133,7 @@ def _labels(run: RecordedRun, seconds: np.ndarray, shown: np.ndarray) -> list[st
     drift, turn = run.sigmas_over_a_second
     status = run.pose_status
     return [
-        f"{seconds[k]:.2f} s, {status[k]}\nsigma {1e3 * position[k]:.3g} mm, {np.degrees(rotation[k]):.3g} deg"
-        + (f"; over a second {1e3 * drift[k]:.3g} mm, {np.degrees(turn[k]):.3g} deg" if np.isfinite(drift[k]) else "")
+        f"{seconds[k]:.2f} s, {status[k]}\nsigma {format_length(position[k])}, {np.degrees(rotation[k]):.3g} deg"
+        + (f"; over a second {format_length(drift[k])}, {np.degrees(turn[k]):.3g} deg" if np.isfinite(drift[k]) else "")
         for k in shown
     ]

@@ -75,6 +75,15 @@ def test_each_run_has_its_lines_figures_and_settings(tmp_path):
     assert "frames 60 25" in page.words
     assert 'command "sigmaslam track x" "sigmaslam track y"' in page.words
     assert "versions" not in page.words.partition("Settings that differ")[2]
+    assert "What each run says one: Tracking was lost in" in page.words
+
+
+def test_runs_without_a_notice_have_no_heading_for_it(tmp_path):
+    for name in ("one", "two"):
+        make_run(tmp_path / name, 40, points=50)
+        frames = tmp_path / name / "frames.csv"
+        frames.write_text(frames.read_text().replace("lost", "tracking"))
+    assert "What each run says" not in _compare(tmp_path, "one", "two").words
 
 
 def test_runs_with_one_truth_are_aligned_by_it(tmp_path):

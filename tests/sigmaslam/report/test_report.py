@@ -172,6 +172,19 @@ def test_labels_and_head_say_how_well_the_last_second_is_known(tmp_path):
     assert "sigma over a second 5 mm, 0.1°" in page.words
 
 
+def test_lengths_and_errors_of_the_calibration_have_units(tmp_path):
+    make_run(tmp_path / "run")
+    covariances = np.load(tmp_path / "run/covariance.npy")
+    covariances[20:23] = np.array([1590.0, 0.25, 0.003])[:, None, None] ** 2 * np.diag([1.0, 0, 0, 0, 0, 0])
+    np.save(tmp_path / "run/covariance.npy", covariances)
+    errors = {"yaw": [-1.62, 0.3], "baseline": [0.01, 0.003]}
+    (tmp_path / "run/run.json").write_text(json.dumps({"summary": {"calibration_errors": errors}}))
+    page = _page(tmp_path / "run")
+    for label, sigma in zip(page.data["scenes"][0]["labels"][20:23], ("1590 m", "25 cm", "3 mm"), strict=True):
+        assert f"sigma {sigma}, 0 deg" in label
+    assert "yaw [px at 45°] -1.62 0.3 baseline +0.01 0.003" in page.words
+
+
 def test_an_evaluation_is_in_the_report(tmp_path):
     make_run(tmp_path / "run")
     run, count = tmp_path / "run", 100
