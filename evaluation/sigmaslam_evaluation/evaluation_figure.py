@@ -60,7 +60,6 @@ def draw_evaluation(
 
     errors = pose_errors(estimate, truth)
     units = ((slice(0, 3), 1.0, "position error [m]"), (slice(3, 6), 180 / math.pi, "rotation error [deg]"))
-    panels = [above, side]
     for column, (part, unit, label) in enumerate(units):
         panel = figure.add_subplot(grid[1, column])
         size = unit * np.linalg.norm(errors.errors[:, part], axis=1)
@@ -73,7 +72,6 @@ def draw_evaluation(
         panel.set_ylim(bottom=0)
         panel.set_title("Error, first poses equal", fontsize=10)
         panel.legend(fontsize=8, loc="upper left")
-        panels.append(panel)
 
     kitti = evaluation.kitti
     values = (
@@ -84,11 +82,9 @@ def draw_evaluation(
         panel = figure.add_subplot(grid[2, column])
         _draw_segments(panel, kitti.lengths, by_length, mean)
         panel.set(xlabel="segment length [m]", ylabel=label)
-        panels.append(panel)
     if spans:
-        panels += [figure.add_subplot(grid[3, 0]), figure.add_subplot(grid[3, 1])]
-        draw_relative(panels[-2], panels[-1], spans)
-    for panel in panels:
+        draw_relative(figure.add_subplot(grid[3, 0]), figure.add_subplot(grid[3, 1]), spans)
+    for panel in figure.axes:
         style_axes(panel)
     return figure
 

@@ -5,63 +5,62 @@ from sigmaslam_evaluation.metrics.trajectory_errors import PoseNees, coverage
 from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.relative_summary import format_relative
 
+# Paths of endoscopes and of cameras at rest are told in millimetres, as metres of four digits would hide their errors.
+_SHORT = 0.1
+_LENGTHS = ("rmse", "mean", "median", "max")
+
 
 def format_evaluation(evaluation: Evaluation) -> str:
     """The evaluation as a text table."""
     e = evaluation
+    unit, size = ("mm", 1e-3) if e.path_length < _SHORT else ("m", 1.0)
     lines = [
         f"estimate  {e.estimate_path}",
         f"truth     {e.truth_path} (paired by {e.association})",
         f"frames    {e.matched} of the {e.frames} with a truth have an estimate ({100 * e.coverage:.1f} %)"
         + (f", {e.predicted} of them while lost, from the motion alone" if e.predicted else ""),
-        f"path      {e.path_length:.2f} m true, {e.estimate_path_length:.2f} m estimated",
+        f"path      {e.path_length / size:.2f} {unit} true, {e.estimate_path_length / size:.2f} {unit} estimated",
         *([f"The truth looks like {e.truth_hint}"] if e.truth_hint else []),
         *(f"The truth {note}" for note in e.truth_notes),
         "",
-        f"{'':<24}{'rmse [m]':>11}{'mean [m]':>11}{'median [m]':>12}{'max [m]':>11}{'rotation [deg]':>16}",
-        *_error_rows(e),
+        f"{'':<24}" + "".join(f"{f'{name} [{unit}]':>12}" for name in _LENGTHS) + f"{'rotation [deg]':>16}",
+        *_error_rows(e, size),
         "",
     ]
     if len(e.kitti.lengths):
         lines.append(f"{'KITTI segments':<24}{'count':>11}{'t_rel [%]':>11}{'r_rel [deg/100 m]':>19}")
-        k = e.kitti
-        columns = (k.lengths, k.counts, k.translation_percent, k.rotation_deg_per_100m)
-        for length, count, translation, rotation in zip(*columns, strict=True):
-            lines.append(f"{f'  {length:g} m':<24}{count:>11}{translation:>11.3f}{rotation:>19.3f}")
-        lines.append(
-            f"{'  all':<24}{e.kitti.counts.sum():>11}{e.kitti.mean_translation_percent:>11.3f}"
-            f"{e.kitti.mean_rotation_deg_per_100m:>19.3f}"
-        )
+        k, names = e.kitti, [f"{length:g} m" for length in e.kitti.lengths]
+        rows = list(zip(names, k.counts, k.translation_percent, k.rotation_deg_per_100m, strict=True))
+        rows.append(("all", k.counts.sum(), k.mean_translation_percent, k.mean_rotation_deg_per_100m))
+        lines += [f"  {name:<22}{count:>11}{shift:>11.3f}{turn:>19.3f}" for name, count, shift, turn in rows]
     else:
         lines.append("KITTI segments: none, the path is shorter than a segment")
     lines += ["", _nees_line(e.nees)]
     if e.final is not None:
-        lines += ["", "After the fact, with loops and smoothing (trajectory_final.tum):", *_error_rows(e.final)]
+        lines += ["", "After the fact, with loops and smoothing (trajectory_final.tum):", *_error_rows(e.final, size)]
         lines.append(_nees_line(e.final.nees))
     verdict = judge_nees(e.nees, e.relative)
     words = ["", verdict["text"]] if verdict else []
     return "\n".join([*lines, "", *format_relative(e.relative), *words]) + "\n"
 
 
-def _error_rows(errors: Evaluation | FinalErrors) -> list[str]:
-    """ATE and RPE, a line each."""
+def _error_rows(errors: Evaluation | FinalErrors, size: float) -> list[str]:
+    """ATE and RPE, a line each, in a unit of `size` metres."""
     # On a straight path the best alignment may turn about the path, by much more than the rotations are wrong.
     rotation_error = errors.ate_origin.rotation_rmse_deg
     straight = errors.ate.turn_deg > rotation_error and errors.ate.rotation_rmse_deg > 2 * rotation_error
     turn = "not determined" if straight else f"{errors.ate.rotation_rmse_deg:.4f}"
-    rows = [
-        f"{name:<24}{ate.rmse:>11.4f}{ate.mean:>11.4f}{ate.median:>12.4f}{ate.maximum:>11.4f}{rotation:>16}"
-        for name, ate, rotation in (
-            ("ATE, best alignment", errors.ate, turn),
-            ("ATE, first pose", errors.ate_origin, f"{errors.ate_origin.rotation_rmse_deg:.4f}"),
-        )
-    ]
     rpe = errors.rpe
-    name = f"RPE, {rpe.delta} frame" + ("s" if rpe.delta > 1 else "")
+    steps = rpe.translation_rmse, rpe.translations.mean(), rpe.translation_median, rpe.translations.max()
+    aligned, first = ((ate.rmse, ate.mean, ate.median, ate.maximum) for ate in (errors.ate, errors.ate_origin))
+    rows = [
+        ("ATE, best alignment", aligned, turn),
+        ("ATE, first pose", first, f"{rotation_error:.4f}"),
+        ("RPE, 1 frame", steps, f"{rpe.rotation_rmse_deg:.4f}"),
+    ]
     return [
-        *rows,
-        f"{name:<24}{rpe.translation_rmse:>11.4f}{rpe.translations.mean():>11.4f}"
-        f"{rpe.translation_median:>12.4f}{rpe.translations.max():>11.4f}{rpe.rotation_rmse_deg:>16.4f}",
+        f"{name:<24}{''.join(f'{each / size:>12.4f}' for each in metres)}{rotation:>16}"
+        for name, metres, rotation in rows
     ]
 
 

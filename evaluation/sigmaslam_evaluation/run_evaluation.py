@@ -45,6 +45,8 @@ from sigmaslam_evaluation.truth_errors import TruthKind, leave_out_interpolated,
 _LOGGER = logging.getLogger(__name__)
 # An error is of poses relative to others.
 _FEWEST_PAIRS = 2
+# Fewer pairs than this share of what is possible are more than some missing poses.
+_USUAL_PAIRS = 0.9
 
 
 def evaluate_run(
@@ -105,6 +107,7 @@ def evaluate_run(
             f"{len(paired)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
             "times.txt of the images beside the pose file"
         )
+    unpaired = _describe_unpaired(estimate, true, len(paired))
     follows_object = is_run and _follows_object(run_or_trajectory)
     convention, has_quaternions = truth_convention or TruthConvention(), trajectory_format(truth) == "tum"
     if convention.quaternion != "xyzw" and not has_quaternions:
@@ -144,7 +147,7 @@ def evaluate_run(
         final=_evaluate_final(run_or_trajectory, estimate, true, of_truth) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
         truth_hint=hint,
-        truth_notes=tuple(note for note in (guess, left_out) if note),
+        truth_notes=tuple(note for note in (guess, left_out, unpaired) if note),
     )
     if plot and is_run:
         keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, evaluation.nees)
@@ -212,6 +215,15 @@ def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None
     if frames is not None and len(frames) == len(truth):
         return estimate, Trajectory(frames.columns["timestamp"], truth.poses), "index"
     return estimate, truth, "time at 10 Hz"
+
+
+def _describe_unpaired(estimate: Trajectory, truth: Trajectory, pairs: int) -> str | None:
+    """A word where fewer poses meet than one of the two has in the time of both, as of two clocks."""
+    begin, end = (f(estimate.timestamps[k], truth.timestamps[k]) for f, k in ((max, 0), (min, -1)))
+    possible = min(np.sum((begin <= each.timestamps) & (each.timestamps <= end)) for each in (estimate, truth))
+    if pairs >= _USUAL_PAIRS * possible:
+        return None
+    return f"meets {pairs} of {possible} poses within {MAX_DIFFERENCE:g} s: are both in the clock of the images?"
 
 
 def _follows_object(run: Path) -> bool:

@@ -80,13 +80,13 @@ class TruthConvention:
         """In words and as options, as `poses of a body ...: --truth-frame body`."""
         words = [
             (self.frame == "body", "poses of a body with x ahead", "--truth-frame body"),
-            (self.inverse, "T_camera_world", "--truth-inverse"),
+            (self.inverse, f"T_{self.frame}_world", "--truth-inverse"),
             (self.quaternion == "wxyz", "quaternions with w first", "--truth-quaternion wxyz"),
             (self.unit == "mm", "millimetres", "--truth-unit mm"),
         ]
-        if self.frame == "body" and self.inverse:
-            words[1] = (True, "T_body_world", "--truth-inverse")
         chosen = [(name, option) for wanted, name, option in words if wanted]
+        if not chosen:
+            return "poses of the camera, in the usual form: give no option on how to read it"
         return f"{', '.join(name for name, _ in chosen)}: {' '.join(option for _, option in chosen)}"
 
 

@@ -129,6 +129,35 @@ def test_missing_frames_lower_the_coverage(drive):
     )
 
 
+def test_a_path_of_centimetres_is_told_in_millimetres(drive, tmp_path):
+    run, truth = drive
+    for source, out in ((run / "trajectory.tum", "estimate.tum"), (truth, "truth.tum")):
+        whole = read_trajectory(source)
+        small = whole.poses.copy()
+        small[:, :3, 3] *= 5e-4
+        write_tum(tmp_path / out, Trajectory(whole.timestamps, small))
+    evaluation = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False)
+    table = format_evaluation(evaluation)
+    assert f"{1e3 * evaluation.path_length:.2f} mm true" in table
+    assert f"{1e3 * evaluation.ate.rmse:.4f}" in table
+    assert "rmse [mm]" in table
+
+
+def test_times_that_rarely_meet_are_told(drive):
+    run, truth = drive
+    assert "clock" not in format_evaluation(evaluate_run(run, truth, plot=False))
+    estimate = read_trajectory(run / "trajectory.tum")
+    regular = Trajectory(0.1 * np.arange(len(estimate)), estimate.poses)  # the drive has 0.1034 s from frame to frame
+    write_tum(run / "trajectory.tum", regular)
+    evaluation = evaluate_run(run, truth, plot=False)
+    assert evaluation.matched < 80
+    words = f"The truth meets {evaluation.matched} of 178 poses within 0.02 s: are both in the clock of the images?"
+    assert words in format_evaluation(evaluation)
+    write_tum(run / "trajectory.tum", regular.subset(np.arange(0, 6)))  # these meet
+    (run / "covariance.npy").unlink()
+    assert "clock" not in format_evaluation(evaluate_run(run, truth, plot=False))
+
+
 def test_a_picture_that_cannot_be_written_costs_a_warning_alone(drive, monkeypatch, caplog):
     def full(path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -70,16 +70,15 @@ def test_ate_equals_evo(truth, alignment, method):
     assert ours.count == len(truth)
 
 
-@pytest.mark.parametrize("delta", [1, 10])
-def test_rpe_equals_evo(truth, delta):
+def test_rpe_equals_evo(truth):
     estimate = _drift(truth)
-    ours = relative_pose_error(estimate, truth, delta)
+    ours = relative_pose_error(estimate, truth)
     relations = evo_metrics.PoseRelation
     for relation, rmse, median, steps in [
         (relations.translation_part, ours.translation_rmse, ours.translation_median, ours.translations),
         (relations.rotation_angle_deg, ours.rotation_rmse_deg, ours.rotation_median_deg, ours.rotations_deg),
     ]:
-        rpe = evo_metrics.RPE(relation, delta=delta, delta_unit=evo_metrics.Unit.frames, all_pairs=True)
+        rpe = evo_metrics.RPE(relation, delta=1, delta_unit=evo_metrics.Unit.frames, all_pairs=True)
         expected = _evo_statistics(rpe, truth, estimate)
         np.testing.assert_allclose(steps, rpe.error, rtol=1e-7)
         assert rmse == pytest.approx(expected["rmse"], rel=1e-9)
@@ -236,8 +235,8 @@ def test_clocks_that_do_not_meet_are_explained():
 
 
 def test_too_short_for_a_step_is_explained():
-    with pytest.raises(InputError, match="needs 11"):
-        relative_pose_error(_straight(1, 5), _straight(1, 5), delta=10)
+    with pytest.raises(InputError, match="needs two"):
+        relative_pose_error(_straight(1, 5).subset([0]), _straight(1, 5))
 
 
 def test_a_trajectory_is_synchronised_with_itself():

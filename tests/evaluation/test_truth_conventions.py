@@ -83,6 +83,17 @@ def test_a_convention_is_named_and_its_options_undo_it(truth: Trajectory, tmp_pa
     assert mended.ate_origin.rotation_rmse_deg == pytest.approx(right.ate_origin.rotation_rmse_deg, rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.parametrize("convention", [TruthConvention("body"), TruthConvention(unit="mm")])
+def test_options_that_a_usual_truth_does_not_need_are_named(
+    truth: Trajectory, tmp_path: Path, convention: TruthConvention
+):
+    write_estimate(tmp_path / "estimate.tum", truth)
+    write_tum(tmp_path / "truth.tum", truth)
+    wrong = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False, truth_convention=convention)
+    assert wrong.truth_hint == TruthConvention().describe()
+    assert "give no option" in wrong.truth_hint
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("both", [True, False], ids=["with rotations", "positions alone"])
 def test_a_mirrored_truth_is_named(tmp_path: Path, axis: int, both: bool):

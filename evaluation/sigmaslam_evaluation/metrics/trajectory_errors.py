@@ -52,12 +52,11 @@ class AbsoluteError:
 
 @dataclass(frozen=True, slots=True)
 class RelativeError:
-    """Relative pose error over steps of `delta` associated frames.
+    """Relative pose error from each associated frame to the next.
 
     Attributes:
         translation_rmse, translation_median: metres a step.
         rotation_rmse_deg, rotation_median_deg: degrees a step.
-        delta: frames in a step.
         translations: (M,) error of each step, metres.
         rotations_deg: (M,) error of each step, degrees.
         forward: (M,) part of each translation's error along the true step, metres, positive where the estimate goes
@@ -69,7 +68,6 @@ class RelativeError:
     translation_median: float
     rotation_rmse_deg: float
     rotation_median_deg: float
-    delta: int
     translations: np.ndarray
     rotations_deg: np.ndarray
     forward: np.ndarray
@@ -225,25 +223,19 @@ def absolute_trajectory_error(estimate: Trajectory, truth: Trajectory, alignment
     )
 
 
-def relative_pose_error(estimate: Trajectory, truth: Trajectory, delta: int = 1) -> RelativeError:
-    """Error of the motion over every step of `delta` associated frames (overlapping steps).
+def relative_pose_error(estimate: Trajectory, truth: Trajectory) -> RelativeError:
+    """Error of the motion from each associated frame to the next.
 
     Where the estimate misses frames, the step over the gap is longer.
 
     Raises:
-        InputError: no timestamps agree, or there are not more than `delta` associated frames.
+        InputError: no timestamps agree, or those of one frame alone.
     """
-    if delta < 1:
-        raise ValueError(f"delta must be at least 1 frame, not {delta}")
     estimate, truth = synchronise(estimate, truth)
-    if len(estimate) <= delta:
-        raise InputError(
-            f"{len(estimate)} frames of estimate and truth agree in time, and a step of {delta} needs "
-            f"{delta + 1}: give a longer trajectory or a smaller delta"
-        )
-    first, last = np.arange(len(truth) - delta), np.arange(delta, len(truth))
-    backward = se3_inverse(_motions(truth.poses, first, last))
-    errors = backward @ _motions(estimate.poses, first, last)
+    if len(estimate) < 2:
+        raise InputError("one frame of estimate and truth agrees in time, and a step needs two: give more")
+    backward = se3_inverse(truth.poses[1:]) @ truth.poses[:-1]
+    errors = backward @ se3_inverse(estimate.poses[:-1]) @ estimate.poses[1:]
     translations = np.linalg.norm(errors[:, :3, 3], axis=1)
     rotations = _angles_deg(errors[:, :3, :3])
     lengths = np.linalg.norm(backward[:, :3, 3], axis=1)
@@ -254,7 +246,6 @@ def relative_pose_error(estimate: Trajectory, truth: Trajectory, delta: int = 1)
         translation_median=float(np.median(translations)),
         rotation_rmse_deg=_root_mean_square(rotations),
         rotation_median_deg=float(np.median(rotations)),
-        delta=delta,
         translations=translations,
         rotations_deg=rotations,
         forward=forward,
