@@ -197,7 +197,10 @@ def _gather(
                 count = len(view)
                 parts.append(Corners(np.full(count, image), np.full(count, eye), points[view.ids], view.pixels))
     if not parts:
-        raise CalibrationError(f"the board is found in none of {len(names)} images: check --board and the images")
+        raise CalibrationError(
+            f"the board is found in none of {len(names)} images: check --board (a chessboard has the numbers of its "
+            "inner corners, one less than of squares) and the images"
+        )
     return Corners.concatenate(parts), outliers
 
 

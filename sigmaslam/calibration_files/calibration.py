@@ -82,6 +82,8 @@ def read_calibration(
         return read_kalibr(content)
     if is_camera_info(content) or "T_BS" in content.entries:
         raise content.error("of one eye; give the files of both with a comma between them, left.yaml,right.yaml")
+    if "camera" in content.entries:
+        raise content.error("of one camera: calibrate with images of both eyes, in left/ and right/, at once")
     if not content.entries.keys() & {"left", "right", "T_left_right"}:
         raise content.error(
             f"no stereo calibration of a known form (keys: {', '.join(map(str, content.entries))}); looked for left + "

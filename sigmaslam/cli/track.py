@@ -92,7 +92,7 @@ def track(
     ] = None,
     map: Annotated[
         Path | None,
-        typer.Option(help="map.npz of an earlier run with the same camera and front-end: poses are in its world."),
+        typer.Option(help="Earlier run, or its map.npz, of the same camera and front-end: poses are in its world."),
     ] = None,
     tracks: Annotated[
         bool, typer.Option("--tracks", help="Also write tracks.npz, what keyframes saw, for `sigmaslam map refine`.")

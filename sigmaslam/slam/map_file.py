@@ -91,7 +91,7 @@ def read_keyframes(
     """Keyframes of a map file.
 
     Args:
-        path: map.npz of a run.
+        path: map.npz of a run, or its folder.
         frontend: that is going to match them.
         camera: the rectified pair that is going to see them.
     Returns:
@@ -99,6 +99,7 @@ def read_keyframes(
     Raises:
         InputError: the file is missing, broken, inconsistent, without keyframes, or of another front-end or camera.
     """
+    path = path / "map.npz" if path.is_dir() else path
     arrays = load_arrays(path, "give map.npz of a run of `sigmaslam track`, or track the sequence again")
     missing = [name for name in _SHAPES if name not in arrays]
     if missing:

@@ -184,7 +184,7 @@ def test_too_few_images_say_so():
     with pytest.raises(CalibrationError, match="2 images show the board to one camera: take 3 or more"):
         calibrate(list("ab"), views, CHESSBOARD.points, [SIZE] * 2, "radtan4")
     nothing = DetectedCorners(np.zeros(0, np.int64), np.zeros((0, 2)))
-    with pytest.raises(CalibrationError, match="the board is found in none of 1 images: check --board"):
+    with pytest.raises(CalibrationError, match=r"board is found in none of 1 images: check --board .*inner corners"):
         calibrate(["a"], [(nothing,)], CHESSBOARD.points, [SIZE], "radtan4")
 
 

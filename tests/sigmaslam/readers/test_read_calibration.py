@@ -195,6 +195,15 @@ def test_kalibr_errors(tmp_path: Path, old: str, new: str, message: str):
     assert str(caught.value).startswith(str(path))
 
 
+def test_a_calibration_of_one_camera_is_named(tmp_path: Path):
+    path = tmp_path / "one.yaml"
+    path.write_text(
+        "camera: {fx: 500}\nresiduals: {}\nparameters: {}\n"
+    )  # as `sigmaslam calibrate` of one eye's images
+    with pytest.raises(CalibrationError, match=r"one\.yaml: of one camera: calibrate with images of both eyes"):
+        read_calibration(path)
+
+
 def test_kalibr_cameras_in_the_wrong_order(tmp_path: Path):
     path = forms.write_kalibr(raw_rig("radtan"), tmp_path)
     content = yaml.safe_load(path.read_text())
