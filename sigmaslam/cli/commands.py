@@ -33,7 +33,7 @@ GROUPS = {
         "localize": "Localise robots among known landmarks (extra 'train').",
     },
     "calibrate": {
-        "board": "From images of a board, or an inertial sensor by a run.",
+        "board": "The default: from images of a board, or an IMU by a run.",
         "show": "Print baseline, rotation, lens models and fields of view.",
         "convert": "Write a calibration of any form in another one.",
         "rectify": "Write rectified pairs.",
@@ -52,7 +52,7 @@ GROUPS = {
         "merge": "Make one map of two runs in one place.",
     },
     "train": {
-        "network": "Train the correspondence network.",
+        "network": "The default: train the correspondence network.",
         "scorer": "Train the probability of matches.",
         "export": "Export trained weights to ONNX.",
         "render": "Render a stereo sequence with exact truth.",
