@@ -1,4 +1,4 @@
-"""The report in a browser: it can be turned, hovered over and scrubbed through, and complains of nothing."""
+"""Pages in a browser: the report can be turned, hovered over and scrubbed through, and complains of nothing."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.dense_points import DENSE_NAME, write_dense_points
+from tests.support.commands import run_here
 from tests.support.recorded_runs import make_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright, of the extra dev")
@@ -151,6 +152,21 @@ def test_nothing_is_wider_than_a_phone(page: Any, scheme: str):
     page.emulate_media(color_scheme=scheme)
     page.set_viewport_size({"width": 400, "height": 800})
     page.wait_for_function("document.documentElement.scrollWidth <= 400", timeout=20_000)
+
+
+def test_the_table_of_a_check_has_whole_words_on_a_phone(browser: Any, tmp_path: Path, demo_sequence: Path):
+    done = run_here("check", demo_sequence, "--out", tmp_path / "check.html")
+    assert done.returncode == 0, done.stderr
+    opened = browser.new_page(viewport={"width": 400, "height": 800})
+    opened.goto((tmp_path / "check.html").as_uri())
+    lines = opened.evaluate(
+        "[...document.querySelectorAll('td:first-child')].map(each => {"
+        " const text = document.createRange(); text.selectNodeContents(each); return text.getClientRects().length; })"
+    )
+    assert len(lines) > 15
+    assert max(lines) <= 2  # "principal point" may stand in two lines
+    assert opened.evaluate("document.documentElement.scrollWidth") <= 400
+    opened.close()
 
 
 def test_a_browser_without_webgl_shows_the_rest(browser: Any, report: Path):
