@@ -5,8 +5,8 @@ from collections import deque
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.frontend.lucas_kanade import lucas_kanade
 from sigmaslam.slam.frame import Frame
-from sigmaslam.slam.rig_change import follow_to_right
 
 # Frames whose rows are compared together, as in a single one most may move alike, and the fewest landmarks in them:
 # in frames of 13 good recordings 15,080 draws of 30 had a ratio of 1 / 1.6 at worst, of 15 two were beyond 1 / 2.
@@ -14,6 +14,8 @@ _FRAMES, _FEWEST = 4, 30
 # Landmarks that are followed to the right eye, or twice as many, and frames in which the eyes must agree again, as the
 # others have spoilt the map.
 _FOLLOWED, _SPOILT = 32, 20
+# Side of their patches, pixels, which reach half as many rows, and how well rows of equal patches are found, pixels.
+_WINDOW, _PRECISE = 21, 0.03
 
 
 class EyeTiming:
@@ -36,9 +38,10 @@ class EyeTiming:
         # A power of two, so that most of them are those of the frame before.
         share = 1 << (max(int(stereo.sum()) // _FOLLOWED, 1).bit_length() - 1)
         chosen = np.flatnonzero(stereo & (landmark_id % share == 0))
-        moved, places, good = follow_to_right(frame.left, frame.right, seen[chosen])
+        expected = seen[chosen, :2] - np.outer(seen[chosen, 2], (1.0, 0.0))
+        found, ended = lucas_kanade(frame.left, frame.right, seen[chosen, :2], expected, _WINDOW, 0)
         rows = np.column_stack([seen[:, 1], np.full(len(seen), np.nan)])
-        rows[chosen[good], 1] = (places + moved)[:, 1]
+        rows[chosen[ended], 1] = found[ended, 1]
         both, now, then = np.intersect1d(landmark_id, self._last[0], assume_unique=True, return_indices=True)
         (left, right), (old_left, old_right) = rows[now].T, self._last[1][then].T
         self._rows.append(np.stack([right - left, right - old_left, old_right - left])[:, : follows * len(both)])
@@ -49,7 +52,7 @@ class EyeTiming:
             middle = np.nanmedian(differences[enough], axis=1, keepdims=True)
             scatter[enough] = np.nanmedian(np.abs(differences[enough] - middle), axis=1)
             same, late, early = scatter
-            if ACCEPTANCE.other_moment * min(late, early) < same:
+            if ACCEPTANCE.other_moment * max(min(late, early), _PRECISE) < same:
                 self._apart_for = _SPOILT
             elif ACCEPTANCE.other_moment * same < min(late, early):
                 self._apart_for = max(self._apart_for - 1, 0)
