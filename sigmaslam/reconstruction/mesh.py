@@ -22,12 +22,12 @@ def need_open3d() -> Any:
     """The module Open3D.
 
     Raises:
-        InputError: it is not installed.
+        InputError: it is not installed, or lacks a library of the system.
     """
     try:
         import open3d
     except ImportError as error:
-        raise InputError("--mesh needs Open3D: pip install 'sigmaslam[dense]', or leave --mesh out") from error
+        raise InputError(f"--mesh needs Open3D ({error}): pip install 'sigmaslam[dense]', or leave it out") from error
     return open3d
 
 
