@@ -60,10 +60,9 @@ class RigWatch:
             return None
         chosen, camera = matches.views.select(fit.inliers), self.window.camera
         expected = seen_from(self.window, chosen.landmark, fit.pose)[:, 2] + self.window.posterior.calibration[0]
-        uvd = np.column_stack([chosen.measurement[:, :2], expected])
-        moved, places, _ = follow_to_right(frame.left, frame.right, uvd[np.isfinite(expected)])
+        moved, places = _follow(frame.left, frame.right, np.column_stack([chosen.measurement[:, :2], expected]))
         before = self.keyframes.active[-1].view
-        usual, _, _ = follow_to_right(before.left, before.right, before.measured(np.isfinite(before.disparity)))
+        usual, _ = _follow(before.left, before.right, before.measured(np.isfinite(before.disparity)))
         if min(len(moved), len(usual)) < self.localiser.config.min_inliers:
             return None
         # Of a camera that was turned what is at the border moves farther.
@@ -77,12 +76,11 @@ class RigWatch:
         return RigChange(fit, -float(shift[0]), float(shift[1]))
 
 
-def follow_to_right(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(M, 2) by how much right places depart from where (u, v, disparity) (K, 3) put those on the left; these; (K,)
-    bool, which of them were found.
-    """
+def _follow(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 2) each: by how much right places depart from where (u, v, disparity) (K, 3) put those on the left; these."""
+    uvd = uvd[np.isfinite(uvd).all(axis=1)]
     expected = uvd[:, :2] - np.outer(uvd[:, 2], (1.0, 0.0))
     found, ended = lucas_kanade(left, right, uvd[:, :2], expected, _WINDOW, _LEVELS)
     back, returned = lucas_kanade(right, left, found, uvd[:, :2], _WINDOW, 0)
     good = ended & returned & (np.linalg.norm(back - uvd[:, :2], axis=1) < 1.0)
-    return (found - expected)[good], expected[good], good
+    return (found - expected)[good], expected[good]
