@@ -142,11 +142,9 @@ class GreyConverter:
         if image.ndim == 2 or image.shape[2] < 3:
             return None
         colour = np.ascontiguousarray(image[..., :3])
-        return (
-            colour
-            if colour.dtype == np.uint8
-            else _to_8_bits(colour, self.significant_bits or _significant_bits(colour))
-        )
+        if colour.dtype == np.uint8 or self.significant_bits is None:
+            return colour
+        return _to_8_bits(colour, self.significant_bits)
 
 
 def _single_channel(image: np.ndarray, name: str) -> np.ndarray:

@@ -40,7 +40,8 @@ class StereoFrame:
         timestamp: seconds.
         left, right: (H, W) uint8 grey images, as stored (not rectified here).
         mask: (H, W) uint8, zero where the left image is not to be used; None: use all of it.
-        colour: (H, W, 3) uint8 of the left image, in OpenCV's order; None where the recording has none.
+        colour: (H, W, 3) uint8 of the left image in OpenCV's order, of the size that is stored; None where the
+            recording has none.
     """
 
     index: int
@@ -205,7 +206,6 @@ class StereoSequence:
                 left = self._check(item.left, item.left_name, self._stored.left, self.camera.left)
                 right = self._check(item.right, item.right_name, self._stored.right, self.camera.right)
                 colour = self._grey.colour(item.left)
-                colour = None if colour is None else _shrink(colour, self._stored.left, self.camera.left)
                 yield StereoFrame(item.index, item.timestamp, left, right, self._mask(item.left_name), colour)
             except FrameError as error:
                 yield SkippedFrame(item.index, item.timestamp, str(error))
@@ -214,7 +214,10 @@ class StereoSequence:
         mismatch = _size_mismatch(image, model)
         if mismatch:
             raise FrameError(f"{name}: {mismatch}")
-        return _shrink(self._grey.convert(image, name), model, wanted)
+        grey = self._grey.convert(image, name)
+        if wanted is model:
+            return grey
+        return np.asarray(cv2.resize(grey, (wanted.width, wanted.height), interpolation=cv2.INTER_AREA))
 
     def _mask(self, left_name: str) -> np.ndarray | None:
         """(H, W) uint8 of a frame."""
@@ -222,12 +225,6 @@ class StereoSequence:
             return None
         mask, size = self.masks.read(left_name).astype(np.uint8), (self.camera.left.width, self.camera.left.height)
         return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST))
-
-
-def _shrink(image: np.ndarray, model: CameraModel, wanted: CameraModel) -> np.ndarray:
-    if wanted is model:
-        return image
-    return np.asarray(cv2.resize(image, (wanted.width, wanted.height), interpolation=cv2.INTER_AREA))
 
 
 def _size_mismatch(image: np.ndarray, model: CameraModel) -> str | None:

@@ -266,6 +266,9 @@ def make_picture(left: np.ndarray, colour: np.ndarray | None, rectifier: StereoR
     """(H, W, 3) uint8 red, green and blue of a rectified left image (H, W), from its colours as they are stored."""
     if colour is None:
         return cv2.cvtColor(left, cv2.COLOR_GRAY2RGB)
+    eye = rectifier.camera.left
+    if colour.shape[:2] != (eye.height, eye.width):
+        colour = cv2.resize(colour, (eye.width, eye.height), interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(rectifier.rectify_left(colour), cv2.COLOR_BGR2RGB)
 
 
