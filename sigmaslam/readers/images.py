@@ -109,7 +109,7 @@ def read_grey(path: Path) -> np.ndarray:
 
 
 class GreyConverter:
-    """Makes every image of one sequence grey and 8-bit by the same rule.
+    """Makes every image of one sequence grey and 8-bit by the same rule, and says once that it does.
 
     16-bit images are scaled by one factor from the significant bits (8 to 16) of the first one seen, so that
     brightness does not jump within the sequence; brighter pixels later on saturate.
@@ -117,6 +117,7 @@ class GreyConverter:
 
     def __init__(self) -> None:
         self.significant_bits: int | None = None
+        self._colour_warned = False
 
     def convert(self, image: np.ndarray, name: str) -> np.ndarray:
         """Convert (H, W) or (H, W, 1 to 4) uint8 or uint16 to (H, W) uint8.
@@ -125,6 +126,9 @@ class GreyConverter:
             FrameError: another pixel type or number of channels.
         """
         grey = _single_channel(image, name)
+        if image.ndim == 3 and image.shape[2] > 2 and not self._colour_warned:
+            self._colour_warned = True
+            logger.warning("%s: colour image; the whole sequence is converted to grey", name)
         if grey.dtype == np.uint16:
             if self.significant_bits is None:
                 self.significant_bits = _significant_bits(grey)

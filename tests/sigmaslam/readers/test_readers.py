@@ -292,11 +292,12 @@ def test_no_readable_image_is_an_error_at_open(tmp_path):
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_colour_is_converted_and_kept(tmp_path, channels):
+def test_colour_is_converted_and_warned_once(tmp_path, caplog, channels):
     _, frames = read_all(make_folder(tmp_path, channels=channels))
     expected = cv2.cvtColor(picture(2, 0, channels)[..., :3].copy(), cv2.COLOR_BGR2GRAY)
     np.testing.assert_array_equal(frames[2].left, expected)
     np.testing.assert_array_equal(frames[2].colour, picture(2, 0, channels)[..., :3])
+    assert sum("colour image" in message for message in messages(caplog)) == 1
 
 
 def test_images_of_a_type_that_is_not_read_are_named(tmp_path, caplog):
