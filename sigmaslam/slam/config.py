@@ -39,8 +39,8 @@ class TrackerConfig:
         max_keypoints: per image.
         constant_sigma: standard deviations of every matched place per axis and of every disparity, pixels, in place of
             the matches' own; for comparison.
-        keyframe_sigma: of a keypoint of the keyframe itself, pixels; small, because the current place is measured
-            relative to its patch.
+        keyframe_sigma: of a keypoint of the keyframe itself, pixels. The current place is measured relative to its
+            patch: it stands for what lenses move one place by and not the other.
         acceleration: square root of the power spectral density of the linear acceleration, in median scene depths
             per s^1.5.
         angular_acceleration: the same for rotation, rad / s^1.5.
@@ -72,7 +72,7 @@ class TrackerConfig:
 
     max_keypoints: int = 1500
     constant_sigma: tuple[float, float] | None = None
-    keyframe_sigma: float = 0.25
+    keyframe_sigma: float = 0.17
     acceleration: float = 0.1
     angular_acceleration: float = 0.5
     start_speed: float = 1.0

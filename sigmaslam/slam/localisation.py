@@ -139,7 +139,7 @@ class Localiser:
             if fit is None or (other is not None and self._is_better(other, fit)):
                 matches, fit = other_matches, other
         min_inliers = ACCEPTANCE.doubtful_inliers * self.config.min_inliers
-        if fit is not None and fit.nis_before_scaling > ACCEPTANCE.doubtful_nis and fit.count < min_inliers:
+        if fit is not None and fit.nis_before_scaling > ACCEPTANCE.noise_nis and fit.count < min_inliers:
             return matches, None  # chance agreement of a few
         return matches, fit
 
