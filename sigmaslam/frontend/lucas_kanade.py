@@ -13,6 +13,8 @@ _WINDOW = 15
 _LEVELS = 4
 # Pixels that the way back may miss by: more keeps corners that slid along an edge, less loses those on slopes.
 _FORWARD_BACKWARD = 0.7
+# Shares of the contrast by which light may differ: eyes that both see well are compared as they are.
+_EQUAL_LIGHT = 0.25
 
 
 def lucas_kanade(
@@ -44,6 +46,15 @@ def lucas_kanade(
     places = found.reshape(-1, 2).astype(np.float64)
     inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
     return places, (status.ravel() > 0) & inside
+
+
+def in_light_of(image0: np.ndarray, image1: np.ndarray) -> np.ndarray:
+    """Image 1 (H, W) uint8, with mean and contrast of image 0 if its light differs, as patches are compared as is."""
+    (mean0, contrast0), (mean1, contrast1) = (np.ravel(cv2.meanStdDev(each[::4])) for each in (image0, image1))
+    gain = float(contrast0 / max(contrast1, 1.0))
+    if max(abs(gain - 1.0), abs(mean1 - mean0) / max(contrast0, 1.0)) < _EQUAL_LIGHT:
+        return image1
+    return np.asarray(cv2.addWeighted(image1, gain, image1, 0.0, float(mean0 - gain * mean1)))
 
 
 def follow_both_ways(

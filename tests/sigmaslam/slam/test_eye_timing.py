@@ -19,13 +19,14 @@ class Texture:
     observe = None
 
 
-def seen_apart(right_rows: np.ndarray, follows: bool = True) -> list[bool]:
-    """What is said of each frame, whose right eye shows the texture by so many rows lower."""
-    noise = np.random.default_rng(2).normal(128.0, 400.0, (170, 210))
+def seen_apart(right_rows: np.ndarray, follows: bool = True, light: float = 1.0) -> list[bool]:
+    """What is said of each frame, whose right eye shows the texture by so many rows lower, from 10 on in that light."""
+    noise = np.random.default_rng(2).normal(128.0, 120.0, (170, 210))  # as faint as sand
     texture = np.clip(cv2.GaussianBlur(noise, (0, 0), 3.0), 0, 255).astype(np.uint8)
     timing, said = EyeTiming(), []
-    for left, right in zip(ROWS, right_rows, strict=True):
-        frame = Frame(np.roll(texture, left, 0), np.roll(texture, (right, -DISPARITY), (0, 1)), Texture)  # type: ignore[arg-type]
+    for number, (left, right) in enumerate(zip(ROWS, right_rows, strict=True)):
+        lit = np.uint8(light * texture) if number >= 10 else texture
+        frame = Frame(np.roll(texture, left, 0), np.roll(lit, (right, -DISPARITY), (0, 1)), Texture)  # type: ignore[arg-type]
         seen = np.column_stack([PLACES + (0, left), np.full(len(PLACES), float(DISPARITY))])
         said.append(timing.are_apart(frame, np.arange(len(PLACES)), seen, follows))
     return said
@@ -40,9 +41,15 @@ def test_another_height_of_the_right_eye_is_no_other_moment(by: int):
     assert not any(seen_apart(ROWS + by))
 
 
+def test_an_eye_that_becomes_dark_is_of_the_same_moment():
+    """Patches that are compared as they are then slide to other rows, of which some fit those before better."""
+    assert not any(seen_apart(ROWS, light=0.5))
+
+
+@pytest.mark.parametrize("light", [1.0, 0.5])
 @pytest.mark.parametrize("late", [1, -1], ids=["right", "left"])
-def test_an_eye_that_is_a_frame_behind_is_named_within_four_frames(late: int):
-    said = seen_apart(np.roll(ROWS, late))
+def test_an_eye_that_is_a_frame_behind_is_named_within_four_frames(late: int, light: float):
+    said = seen_apart(np.roll(ROWS, late), light=light)
     assert all(said[4:])
 
 
