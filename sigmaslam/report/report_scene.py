@@ -83,7 +83,7 @@ def _points(run: RecordedRun) -> dict[str, Any]:
     if run.map is None:
         return {"points": np.zeros((0, 3)), "point_sigma": np.zeros(0), "point_grey": None}
     shown = _even(len(run.map.points), MAX_POINTS)
-    grey = run.map.colours[shown]
+    grey = run.map.colours[shown, 0]
     known = np.isfinite(grey).all()
     return {
         "points": _placed_points(run)[shown],

@@ -21,7 +21,8 @@ class RecordedPoints:
     Attributes:
         points: (N, 3) in the world, metres.
         sigma: (N,) root of the largest eigenvalue of the covariance, metres; NaN where it is not known.
-        colours: (N,) grey values in the images, or (N, 3) red, green and blue, 0 to 255; NaN where they are not known.
+        colours: (N, 3) red, green and blue in the images, 0 to 255, all three the grey value of a map; NaN where they
+            are not known.
     """
 
     points: np.ndarray

@@ -177,7 +177,8 @@ def _read_map(path: Path) -> RecordedPoints | None:
     largest = np.full(len(points), np.nan)
     if known.any():
         largest[known] = np.linalg.eigvalsh(covariances[known])[:, -1]
-    return RecordedPoints(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], arrays["intensity"][kept])
+    colours = np.repeat(arrays["intensity"][kept, None], 3, axis=1)
+    return RecordedPoints(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], colours)
 
 
 def _read_json(path: Path, command: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend.lucas_kanade import lucas_kanade
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
@@ -79,7 +80,7 @@ class RigWatch:
 def _follow(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(M, 2) each: by how much right places depart from where (u, v, disparity) (K, 3) put those on the left; these."""
     uvd = uvd[np.isfinite(uvd).all(axis=1)]
-    expected = uvd[:, :2] - np.outer(uvd[:, 2], (1.0, 0.0))
+    expected = RectifiedStereo.right_pixels(uvd)
     found, ended = lucas_kanade(left, right, uvd[:, :2], expected, _WINDOW, _LEVELS)
     back, returned = lucas_kanade(right, left, found, uvd[:, :2], _WINDOW, 0)
     good = ended & returned & (np.linalg.norm(back - uvd[:, :2], axis=1) < 1.0)
