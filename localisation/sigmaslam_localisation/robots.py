@@ -1,7 +1,5 @@
 """Robots of a recording, localised in two passes: the first finds delay, constants and noise, the second uses them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -75,8 +73,8 @@ class RobotEstimate:
     scale: np.ndarray
     truth: PlanarTruth | None
     map: LandmarkMap | None = None
-    smoothed: RobotEstimate | None = None
-    lagged: RobotEstimate | None = None
+    smoothed: "RobotEstimate | None" = None
+    lagged: "RobotEstimate | None" = None
 
 
 def localise_robots(

@@ -1,7 +1,5 @@
 """Relative pose without a prediction (9.5.1): 5-point method with scale from stereo, checked against P3P."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -55,7 +53,7 @@ class RelativePose:
     foreseen: int = 0
     by_calibration: np.ndarray = field(default_factory=lambda: np.zeros((6, CALIBRATION_SIZE)))
 
-    def with_shared_errors(self, calibration: np.ndarray) -> RelativePose:
+    def with_shared_errors(self, calibration: np.ndarray) -> "RelativePose":
         """The same whose covariance has what neighbours share, and the calibration's errors of covariance (15, 15)."""
         shared = self.by_calibration @ calibration @ self.by_calibration.T
         return replace(self, covariance=max(self.clustering, 1.0) * self.covariance + shared)
@@ -118,7 +116,7 @@ def foresee(
     return predicted, covariance, front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
 
 
-def _best(matches: _StereoMatches, candidates: list[np.ndarray | None]) -> RelativePose | None:
+def _best(matches: "_StereoMatches", candidates: list[np.ndarray | None]) -> RelativePose | None:
     """Of poses T_camera_key (4, 4) the one with the smallest misfit once refined."""
     guesses = [guess for guess in candidates if guess is not None and np.isfinite(guess).all()]
     if not guesses:

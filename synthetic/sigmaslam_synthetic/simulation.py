@@ -1,7 +1,5 @@
 """All that a rendered sequence is made of; any of its frames can be made alone, again, and in any process."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -147,7 +145,7 @@ class Simulation:
         }
 
     @classmethod
-    def from_json(cls, content: dict[str, Any]) -> Simulation:
+    def from_json(cls, content: dict[str, Any]) -> "Simulation":
         """The simulation that `to_json` wrote."""
         return cls(
             Scene.from_json(content["scene"]),

@@ -1,7 +1,5 @@
 """The stereo camera as it is and as its calibration says: the two differ by what real calibrations get wrong."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -77,7 +75,7 @@ class Rig:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, content: dict[str, Any]) -> Rig:
+    def from_json(cls, content: dict[str, Any]) -> "Rig":
         """The rig that `to_json` wrote."""
         errors = {**content["errors"], "rotation": tuple(content["errors"]["rotation"])}
         return cls(
