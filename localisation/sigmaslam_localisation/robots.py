@@ -107,7 +107,7 @@ def localise_robots(
     starts = first_poses(recordings, steps.seconds[0, ::count], start)
     robot = WheeledRobot.of(recordings[0])
     prior = robot.prior(starts)
-    repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
+    repeated = prior[torch.arange(len(recordings)).repeat_interleave(count)]
     platform: Platform = robot
     space: Space = SPACE
     if mapping:
@@ -121,7 +121,7 @@ def localise_robots(
     at_first = _estimates(recordings, delays, steps, first, chosen, space)
 
     steps = make_steps(recordings, delays)
-    prior = _with_constants(prior, _pick(first.final, torch.from_numpy(chosen)))
+    prior = _with_constants(prior, first.final[torch.from_numpy(chosen)])
     prior = mapper.enter(prior) if mapping else prior
     scale = torch.from_numpy(first.scale[-1, chosen])
     second = localise(
@@ -168,18 +168,12 @@ def first_poses(
     return torch.from_numpy(np.stack(poses))
 
 
-def _pick(belief: Gaussian, index: Tensor) -> Gaussian:
-    return Gaussian(belief.mean[index], belief.covariance[index])
-
-
 def _with_constants(prior: Gaussian, known: Gaussian) -> Gaussian:
     """The prior's poses, and the constants as they are known."""
     mean, covariance = prior.mean.clone(), prior.covariance.clone()
     constants = slice(BODY.point_size, ROBOT_SIZE)
-    mean[:, constants], covariance[:, constants, constants] = (
-        known.mean[:, constants],
-        known.covariance[:, constants, constants],
-    )
+    mean[:, constants] = known.mean[:, constants]
+    covariance[:, constants, constants] = known.covariance[:, constants, constants]
     return Gaussian(mean, covariance)
 
 

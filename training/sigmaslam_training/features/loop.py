@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 from torch import nn
-from torch.utils.data import DataLoader
 
 from sigmaslam.files import atomic_path, atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
@@ -132,14 +131,14 @@ class _Run:
                 raise TrainingStopped(self._saved, self._state.config.steps) from None
 
     def _steps(self, workers: int, interruption: Interruption) -> None:
-        state, config = self._state, self._state.config
+        state, config, place = self._state, self._state.config, self._place
         task = self._progress.add_task("training", total=config.steps, completed=state.step, note="")
         # The workers begin while this process validates.
-        batches = iter(self._loader(workers))
+        batches = iter(pair_loader(config, state.step, workers, place.rank, place.ranks, place.on_gpu))
         self._validate_if_due()
         for batch in batches:
             with interruption.whole_step():
-                loss = self._step(to_device(batch, self._place))
+                loss = self._step(to_device(batch, place))
             self._progress.update(task, completed=state.step)
             last = state.step == config.steps
             if state.step % _SHOW_EVERY == 0 or last:
@@ -149,22 +148,6 @@ class _Run:
             self._validate_if_due()
             if state.step % config.checkpoint_every == 0 or last:
                 self._save()
-
-    def _loader(self, workers: int) -> DataLoader[TrainingPair]:
-        config, place = self._state.config, self._place
-        return pair_loader(
-            config.mix,
-            config.seed,
-            config.size,
-            self._state.step * config.batch_size,
-            config.steps * config.batch_size,
-            config.points,
-            config.batch_size,
-            workers,
-            place.rank,
-            place.ranks,
-            pinned=place.on_gpu,
-        )
 
     def _step(self, batch: TrainingPair) -> PairLoss:
         """One step of the optimiser."""
