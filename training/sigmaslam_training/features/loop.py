@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 from torch import nn
 
-from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
 from sigmaslam_training.devices import Workplace, loss_module, open_workplace, to_device
 from sigmaslam_training.features.checkpoint import (
@@ -30,6 +29,7 @@ from sigmaslam_training.features.validation import PAIRS, held_out_seed, held_ou
 from sigmaslam_training.interruption import Interruption
 from sigmaslam_training.journal import Journal
 from sigmaslam_training.run_card import CARD_NAME, describe_origin, make_card
+from sigmaslam_training.snapshot import save_tensors
 
 WEIGHTS_NAME = "features.safetensors"
 _LOG_EVERY = 50
@@ -80,8 +80,7 @@ def train(
             _Run(state, place, out, journal).finish(workers)
         card = make_card(state, place)
         if place.leads:
-            with atomic_path(out / WEIGHTS_NAME) as path:
-                save_file({name: value.cpu().contiguous() for name, value in state.network.state_dict().items()}, path)
+            save_tensors(out / WEIGHTS_NAME, state.network.state_dict())
             atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
     return card
 
