@@ -115,7 +115,7 @@ class MappingRobot(WheeledRobot):
 
     @property
     def space(self) -> MapSpace:
-        """Of the state."""
+        """Of the state: the robot's pose and constants, then the places of the landmarks."""
         return MapSpace(self.lever, self.landmarks, self.origin)
 
     def enter(self, alone: Gaussian) -> Gaussian:

@@ -126,7 +126,10 @@ def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
 
 
 def _check_distortion(matches: EyeMatches, rectifier: StereoRectifier) -> Finding:
-    """Whether images that the calibration undistorts are rectified already: then they have larger row differences."""
+    """Whether images that the calibration undistorts are rectified already.
+
+    A rectification that is right leaves smaller row differences than there were, whatever else is wrong.
+    """
     if rectifier.camera.is_rectified:
         return Finding("distortion", "ok", "the calibration is of rectified images")
     stored = leave_unrectified(matches, rectifier)

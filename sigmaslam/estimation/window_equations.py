@@ -41,7 +41,10 @@ def gate_views(window: "KeyframeWindow", observations: KeyframeViews) -> np.ndar
 def _views(
     window: "KeyframeWindow", observations: KeyframeViews, rows: np.ndarray, owner: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`, whose landmark (K,) is `owner` (O,)."""
+    """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`.
+
+    View o of O sees the landmark in row `rows[owner[o]]` (K,) of the landmark table.
+    """
     state, landmarks, views = window.posterior, window.landmarks, observations.views
     anchor = landmarks.anchor[views.landmark]
     pairs, pair = np.unique(anchor * len(state) + observations.keyframe, return_inverse=True)

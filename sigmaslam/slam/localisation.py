@@ -230,7 +230,10 @@ class Localiser:
     def _fit_alone(
         self, matches: GuidedMatches, near: GuidedMatches, prediction: Prediction, start: np.ndarray, scale: float
     ) -> FrameFit | None:
-        """The pose of what was found around `start` (4, 4), by so uncertain a prediction; None if that has a rival."""
+        """The pose of what was found around `start` (4, 4), by a prediction as uncertain as it asks for.
+
+        None where what agrees with the prediction itself explains a rival's part of the image.
+        """
         excess = surprise(self.motion, se3_inverse(self.window.posterior.poses[-1]) @ start)
         pose, covariance, least = prediction.pose, prediction.covariance, self.config.min_inliers
         fit = self.update.fit(matches.views, pose, excess * covariance, least, start, scale)

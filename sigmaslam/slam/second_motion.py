@@ -153,7 +153,10 @@ def find_scene_behind(
 
 
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:
-    """(M,) bool, of `others` (K,) those that depart (K pixels), and as many that do not, which stand for most cells."""
+    """(M,) bool, those of `others` (K,) that depart from a pose, and as many that do not, which stand for most cells.
+
+    `departs` (K,) are pixels from where the pose sees them; `cells` (M,) of the image are of all matches.
+    """
     share = 1.0 / np.bincount(cells)[cells[others]]
     same = are_one_place(departs)
     order = np.lexsort((-share, same))

@@ -231,7 +231,10 @@ class _StereoMatches:
 def _project(
     camera: RectifiedStereo, landmarks: np.ndarray, T_camera_key: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where landmarks (M, 3) are seen, and whether in front (M,); derivatives by T from the left, and by landmarks."""
+    """Where landmarks (M, 3) of a keyframe are seen, (M, 3), and whether in front of the camera (M,).
+
+    And the derivatives by a perturbation of T from the left (M, 3, 6) and by the landmark (M, 3, 3).
+    """
     focal = camera.focal_baseline
     # Points are scaled by inverse depth, so that points at infinity are regular.
     rays = camera.rays(landmarks[:, :2])
@@ -259,7 +262,10 @@ def _spread(by: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: float) -> np.ndarray | None:
-    """Gauss-Newton with a robust loss whose scale shrinks; variances are `variance` times the claimed ones."""
+    """Gauss-Newton with a robust loss whose scale shrinks from step to step; None where points leave the pose open.
+
+    Variances are `variance` times the claimed ones.
+    """
     scale = _FIRST_SCALE
     for _ in range(_STEPS):
         _, normal, gradient = matches.equations(T_camera_key, variance * scale**2)
