@@ -22,7 +22,7 @@ def counted(title: str, total: int | None) -> Iterator[Callable[[], None]]:
 
 
 def open_progress(hidden: bool = False, console: "Console | None" = None, line_every: float = LINE_EVERY) -> "Progress":
-    """Tasks with a field `note`, behind the bar and the time that is left; nothing is shown where it is hidden.
+    """Tasks with a field `note`, behind the bar and the time that is left.
 
     Args:
         hidden: nothing is shown.

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.calibration.board_bundle import BoardBundle, Corners, Rig, project_corners, solve_bundle
-from sigmaslam.calibration.boards import DetectedCorners
+from sigmaslam.calibration.boards import MIN_CORNERS, DetectedCorners
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel
 from sigmaslam.geometry.se3 import rigid_motion, rotation_log, se3_inverse
@@ -21,8 +21,6 @@ LENSES: dict[str, tuple[DistortionModel, int]] = {
 }
 """Lens models by their names on the command line, with the number of coefficients."""
 
-# Of one image; below, they say hardly more than where the board is.
-MIN_CORNERS = 6
 MIN_IMAGES = 3
 # An image with so many times the rms of the median image does not belong to this board; it is blurred or misread.
 OUTLIER_IMAGE = 3.0

@@ -25,6 +25,7 @@ def write_page(path: Path, check: Check, source: str) -> None:
     Raises:
         InputError: the folder is missing or cannot be written.
     """
+    shown = even_rows(len(check.steps), _MOST).tolist()
     kind, word = verdict(check.findings)
     text = load_template("check.html").render(
         styles=read_asset("report.css"),
@@ -33,15 +34,10 @@ def write_page(path: Path, check: Check, source: str) -> None:
         word=word,
         faults=wrong(check.findings),
         findings=check.findings,
-        pictures=[(f"pair {index}", _picture(check, k)) for k, index in _shown(check)],
+        pictures=[(f"pair {check.steps[k][0].index}", _picture(check, k)) for k in shown],
         tolerance=ROW_TOLERANCE,
     )
     atomic_write_text(path, text)
-
-
-def _shown(check: Check) -> list[tuple[int, int]]:
-    """Number among the samples and index in the sequence of the pairs that are drawn."""
-    return [(k, check.steps[k][0].index) for k in even_rows(len(check.steps), _MOST).tolist()]
 
 
 def _picture(check: Check, number: int) -> str:

@@ -22,10 +22,9 @@ from sigmaslam.run_record.frame_pictures import PICTURES_NAME, FramePictures, re
 from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, read_frames
 from sigmaslam.run_record.inertial_file import InertialRecords, read_inertial_records
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
-from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, RUN_NAME
+from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, MAP_NAME, RUN_NAME
 
 REFINED_TRAJECTORY, REFINE_NAME = "trajectory_refined.tum", "refine.json"
-_MAP_NAME = "map.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +119,7 @@ def read_run(folder: Path) -> RecordedRun:
         pose_row=pose_row,
         final=_read_trajectory(folder / FINAL_TRAJECTORY),
         refined=_read_trajectory(folder / REFINED_TRAJECTORY),
-        map=_read_map(folder / _MAP_NAME),
+        map=_read_map(folder / MAP_NAME),
         dense=read_dense_points(folder / DENSE_NAME) if (folder / DENSE_NAME).is_file() else None,
         pictures=read_pictures(folder / PICTURES_NAME) if (folder / PICTURES_NAME).is_file() else None,
         entries=_read_json(folder / RUN_NAME, "track"),

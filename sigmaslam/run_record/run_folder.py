@@ -33,7 +33,7 @@ from sigmaslam.slam.point_map import PointMap
 
 FINAL_TRAJECTORY, FINAL_COVARIANCE = "trajectory_final.tum", "covariance_final.npy"
 RUN_NAME = "run.json"
-VIDEO_NAME, RERUN_NAME = "video.mp4", "rerun.rrd"
+MAP_NAME, REPORT_NAME, VIDEO_NAME, RERUN_NAME = "map.npz", "report.html", "video.mp4", "rerun.rrd"
 """Of what may stand in the folder beside the results."""
 UNFINISHED = "not yet"
 """What run.json has under `ended` while a run goes on, and after it was killed."""
