@@ -141,7 +141,8 @@ class _Run:
             self._progress.update(task, completed=state.step)
             last = state.step == config.steps
             if state.step % _SHOW_EVERY == 0 or last:
-                self._progress.update(task, note=_note(loss))
+                note = " ".join(f"{name} {float(value.detach()):.3f}" for name, value in loss._asdict().items())
+                self._progress.update(task, note=note)
             if state.step % _LOG_EVERY == 0 or last:
                 self._log(loss)
             self._validate_if_due()
@@ -199,7 +200,3 @@ class _Run:
             self._state.seconds = time.monotonic() - self._began
             save_checkpoint(self._checkpoint, self._state)
             self._saved = self._state.step
-
-
-def _note(loss: PairLoss) -> str:
-    return " ".join(f"{name} {float(value.detach()):.3f}" for name, value in loss._asdict().items())
