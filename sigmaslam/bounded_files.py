@@ -128,7 +128,6 @@ def load_arrays(path: Path, mend: str, names: Collection[str] | None = None) -> 
     The sizes that the archive and the arrays' headers state are checked before any memory is taken.
 
     Args:
-        path: of the archive.
         mend: what to do about a bad one, for the message.
         names: of the arrays to read; None: all.
     Raises:

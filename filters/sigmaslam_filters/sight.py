@@ -19,7 +19,6 @@ class Sight:
 
     Attributes:
         linearisation: how it is linearised.
-        measurement: the model.
         inputs: of the model's function.
         value: (..., m), zero for what is missing.
         mean, root: (..., p), (..., n, n) of the prior belief.

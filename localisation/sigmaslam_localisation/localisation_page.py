@@ -31,7 +31,6 @@ def write_page(
     """Write the page.
 
     Args:
-        path: the file.
         name: of the recording.
         summaries: by robot, label and value.
         figures: title, caption and figure of each.

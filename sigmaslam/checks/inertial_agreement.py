@@ -61,7 +61,6 @@ def judge_motion(
         times: (N,) seconds.
         poses: (N, 4, 4) T_world_camera of the left camera.
         tracked: (N,) bool, poses that come from images.
-        recording: the sensor.
     """
     both = np.flatnonzero(tracked[:-1] & tracked[1:])
     R, sensor = poses[:, :3, :3], recording.sensor

@@ -41,7 +41,6 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
 
     Args:
         matches: of pairs of one rig, rectified by `rectifier`.
-        rectifier: of the calibration.
         frame_interval: seconds from one frame to the next; None: unknown.
     """
     if len(matches) < MIN_MATCHES:

@@ -121,7 +121,6 @@ def check_sink_path(option: str, path: Path, out: Path, name: str) -> None:
 
     Args:
         option: of the command line, for messages.
-        path: of the file.
         out: folder of the run, which may be still to make.
         name: that the file has in the folder of a run, where `--overwrite` removes it; elsewhere its suffix counts.
     Raises:

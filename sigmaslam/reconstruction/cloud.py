@@ -110,7 +110,6 @@ class DepthPixels(Table):
         """Points in the world.
 
         Args:
-            camera: the rectified pair.
             pose, pose_covariance: (4, 4) T_world_rectified and its covariance (6, 6) in the rectified camera's frame,
                 translation (metres) before rotation (radians).
         """

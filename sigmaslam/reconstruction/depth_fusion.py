@@ -132,7 +132,6 @@ def fuse_depth(
         reference: its disparities.
         others: of each other keyframe its view, T_other_reference (4, 4), and the covariance (6, 6) of that,
             perturbed from the left: translation (metres) before rotation (radians).
-        camera: the rectified pair.
         shared: of the variances this share is common to all of them.
     """
     shape = reference.disparity.shape

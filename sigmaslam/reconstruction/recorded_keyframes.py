@@ -39,7 +39,6 @@ class RecordedKeyframes:
 
     Attributes:
         source, format: of the run's input.
-        camera: its calibration.
         is_keyframe: (K,) bool.
         timestamps: (K,) seconds.
         poses: (K, 4, 4) T_world_camera of the left camera, after the fact where the run has that.

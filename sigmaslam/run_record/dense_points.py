@@ -35,7 +35,6 @@ def write_dense_points(path: Path, points: np.ndarray, sigma: np.ndarray, colour
     """Writes an even selection of points.
 
     Args:
-        path: of the file.
         points, sigma, colours: (N, 3), (N,) and (N, 3) as of `RecordedPoints`; float32 and uint8 are kept.
     """
     rows = even_rows(len(points), MAX_POINTS)

@@ -38,7 +38,6 @@ class RecordedRun:
         covariances: (N, 6, 6) in their own frames, translation (metres) before rotation (radians); NaN without them.
         pose_row: (N,) row in `frames` of each pose.
         final, refined: trajectories after the fact and after `sigmaslam map refine`.
-        map: the points.
         dense: points of `sigmaslam map reconstruct`.
         pictures: of some frames.
         entries: of run.json.

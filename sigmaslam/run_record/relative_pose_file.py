@@ -78,7 +78,6 @@ def read_frame_pairs(path: Path, count: int) -> FramePairs:
     """The content of a relative_poses.npz.
 
     Args:
-        path: of the file.
         count: poses of trajectory.tum beside it.
     Raises:
         InputError: it is no such file, or of another run.

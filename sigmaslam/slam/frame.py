@@ -71,7 +71,6 @@ def usable_pixels(mask: np.ndarray | None, rectifier: StereoRectifier) -> np.nda
 
     Args:
         mask: (H, W) bool or uint8 of the raw left image, zero where it is not to be used; None: nothing is masked.
-        rectifier: of the camera.
     Raises:
         FrameError: the mask has the wrong type or size, or is zero everywhere.
     """

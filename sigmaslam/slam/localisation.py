@@ -65,7 +65,6 @@ class Localiser:
         guided: finds landmarks near a prediction.
         follower: finds them without features.
         unguided: finds keyframes anywhere.
-        config: settings.
         frame_clock: knows the interval of the frames.
     """
 
@@ -86,7 +85,6 @@ class Localiser:
         Nor beside a sensor after half a second: features are found by its prediction, and optical flow strays.
 
         Args:
-            frame: the current one.
             keyframes: of the window.
             prediction: of its pose.
             clock: takes the time of the stages `match` and `filter`.
@@ -122,7 +120,6 @@ class Localiser:
         """Matches and pose of a view, first near the prediction, then anywhere; no pose where too little agrees.
 
         Args:
-            view: the current one.
             keyframes: what the window's keyframes saw.
             prediction: of its pose.
             guided: the velocity is known, so that the prediction says where to search.

@@ -37,11 +37,7 @@ class RigChange:
 
 @dataclass(frozen=True, slots=True)
 class RigWatch:
-    """Looks for bumps where a frame does not fit what was known.
-
-    Attributes:
-        window, localiser, keyframes: of the tracker.
-    """
+    """Looks for bumps where a frame does not fit what was known."""
 
     window: KeyframeWindow
     localiser: Localiser
@@ -51,7 +47,6 @@ class RigWatch:
         """The bump before a frame; None where the left image gives no pose, or the right one fits it as before.
 
         Args:
-            frame: the current one.
             matches: landmarks that were followed to it, with disparities that may be wrong.
             prediction: of its pose.
         """

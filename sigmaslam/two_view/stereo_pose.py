@@ -76,7 +76,6 @@ def estimate_relative_pose(
     The claimed sigmas are scaled to the errors of half of the points, as matches may be better than claimed.
 
     Args:
-        camera: the rectified pair.
         landmarks: (M, 3) (u, v, disparity) in the keyframe.
         landmark_sigma: (M, 3) their standard deviations, pixels.
         measurement: (M, 3) (u, v, disparity) in the current view; the disparity may be NaN.

@@ -41,7 +41,6 @@ def write_snapshot(
     """Writes everything that changes while a training lasts; the file appears whole or not at all.
 
     Args:
-        path: of the file.
         network, optimizer, schedule: in training.
         step: steps that are done.
         facts: to be kept beside them, as JSON.
