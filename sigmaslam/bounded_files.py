@@ -32,7 +32,6 @@ def read_bytes(path: Path, limit: int, what: str, error: type[InputError] = Inpu
         path: file or link to one. A pipe or a device, which may never end, is refused before it is read.
         limit: bytes; larger files are refused.
         what: the file should be, for the message, such as "the trajectory".
-        error: to raise.
     Raises:
         InputError: the file is missing, larger, no regular file, or may not be read.
     """

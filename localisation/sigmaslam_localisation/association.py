@@ -195,8 +195,7 @@ class Association:
         residual = self._robot.measurement().residual
         if residual is None:
             return value - expected
-        difference: np.ndarray = residual(torch.from_numpy(value), torch.from_numpy(expected)).numpy()
-        return difference
+        return np.asarray(residual(torch.from_numpy(value), torch.from_numpy(expected)))
 
 
 def associate(

@@ -29,7 +29,6 @@ class Smoother:
     """One robot's steps, ready for recursions backwards in time.
 
     Attributes:
-        space: of the states.
         mean: (K + 1, p) filtered.
         covariance: (K + 1, n, n) filtered.
         gain: (K, n, n) G.
@@ -51,7 +50,6 @@ class Smoother:
         """Of each robot.
 
         Args:
-            space: of the states.
             filtered: (K + 1, B) beliefs.
             moved: (K, B) what `BayesFilter.predict` makes of all but the last of them.
         """

@@ -42,7 +42,6 @@ class BodyAdmission:
 
     Args:
         region: (H, W) bool, where the body is in the first rectified left image.
-        frontend: matches features.
 
     Attributes:
         T_camera_body: (4, 4) the body's frame in the first rectified camera, whose axes it has.

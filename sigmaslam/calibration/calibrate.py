@@ -49,7 +49,6 @@ class BoardCalibration:
     """A calibration with how well it is known.
 
     Attributes:
-        rig: the cameras.
         covariance: (P, P) of `rig.names`; pixels, coefficients, metres, radians.
         sigma: of a corner's coordinate, pixels.
         design_effect: by how much corners of one image that are wrong together enlarge the covariance.
@@ -59,7 +58,6 @@ class BoardCalibration:
         outlier_images: those that are not used.
         outlier_corners: single corners of these images that are not used.
         outlier_residuals: (K, 2) theirs, pixels.
-        bundle: the solution.
     """
 
     rig: Rig

@@ -124,7 +124,6 @@ def calibrate_imu(
 
     Args:
         path: of the left camera.
-        samples: of the sensor.
         sensor: its noise; mounting and time shift are where the search begins: the rotation may be anything.
         shared_errors: so many times fewer poses than there are have errors of their own.
         done: called after each of at most 25 rounds.

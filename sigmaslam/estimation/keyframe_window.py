@@ -43,7 +43,6 @@ class KeyframeWindow:
 
     Args:
         calibration: prior of its errors.
-        graphs: the equations.
         student_freedom: degrees of freedom of the errors' Student-t; infinite: Gaussian.
         usual: prior of a calibration with which nothing is wrong; `calibration` by default.
 

@@ -26,7 +26,6 @@ class TrackedFrame:
 
     Attributes:
         number: of its row in frames.csv, from 0 on.
-        result: of the tracker.
         seen: the images with their matches; None where a caller has none.
         colour: of the frame, as `StereoFrame` has it.
     """

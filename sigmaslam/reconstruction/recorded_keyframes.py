@@ -183,7 +183,6 @@ def open_input(keyframes: RecordedKeyframes, moved_to: Path | None = None) -> St
     """The run's input, with images of the size of the run's calibration.
 
     Args:
-        keyframes: of the run.
         moved_to: where the input is now, if not where the run found it.
     Raises:
         InputError: it is not there, or is another one.

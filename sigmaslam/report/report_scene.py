@@ -24,7 +24,6 @@ def build_scene(run: RecordedRun, most: int = MAX_POSES, start: float | None = N
     Of a run that follows a body the path is the body's, and its points are where it was last.
 
     Args:
-        run: the run.
         most: poses of its path.
         start: time stamp of 0 s; by default that of the first frame.
     """

@@ -92,7 +92,6 @@ class RunWriter:
         """Takes the result of one frame; it is on disk when this returns.
 
         Args:
-            estimate: of the camera.
             pose, covariance: (4, 4), (6, 6) of what is tracked: the camera in the world, or a body in the camera.
             matching: (6, 6) the part of the covariance that comes from matches and motion.
             read_ms: time it took to read the images.

@@ -47,7 +47,6 @@ class TrackerResults:
     """What the tracker alone knows when a run ends; each is computed when it is written.
 
     Attributes:
-        point_map: the landmarks.
         keyframes: arrays by name, with which a later run relocalises in the map.
         final: the frames as they are known in the end, with covariances; they are written beside those said at once.
             None where other sensors corrected the poses, whose covariances then have no part of matches alone.

@@ -21,7 +21,6 @@ class Frame:
 
     Args:
         left, right: (H, W) uint8, rectified.
-        frontend: detects features.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
         exchanged: gives left and right as they are if each image is the other eye's; by default as they are here.
     """

@@ -61,7 +61,6 @@ class GuidedMatcher:
     """Active search: finds landmarks within the innovation ellipse of their prediction, keyframe by keyframe.
 
     Attributes:
-        frontend: matches features.
         window: whose landmarks are searched for.
         update: predicts them.
         noise: of what is matched.

@@ -56,7 +56,6 @@ def find_second_motion(
     They are held against where the fit's pose sees the landmarks, as if that were a keyframe: `estimate_relative_pose`.
 
     Args:
-        window, matches, fit: of the frame.
         moving: where the scene moves on its own; None: all of it may, but for one body.
     """
     views, camera = matches.views, window.camera

@@ -28,7 +28,6 @@ class UnguidedMatcher:
     """Finds keyframes in views, wherever they are.
 
     Attributes:
-        frontend: matches features.
         window: whose calibration corrects the disparities.
         noise: of what is matched.
     """

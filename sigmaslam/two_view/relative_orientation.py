@@ -312,7 +312,10 @@ def _fit_places(
 
 
 def _turn_alone(rays: MatchedRays, best: _Fit) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rotation and its covariance (3, 3) if the inliers follow a mere turn within their errors, else None."""
+    """Rotation and its covariance (3, 3) if the inliers follow a mere turn within their errors, else None.
+
+    The turn that takes the rays nearest to each other (Kabsch 1976) is as good as the best one where errors are alike.
+    """
     near = rays.chosen(best.inliers)
     R, _, squared, information = _fit_places(near, best.R, best.direction, slice(0, 3))
     variance = float(squared.mean()) / 2.0

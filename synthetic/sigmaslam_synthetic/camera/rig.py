@@ -100,7 +100,6 @@ def loose_rig(
         camera: the left camera.
         baseline: metres.
         rng: source of the differences.
-        errors: of the calibration.
     """
     R = Rotation.from_rotvec(np.deg2rad(_LOOSE_DEGREES) * rng.standard_normal(3)).as_matrix()
     T = rigid_motion(R, baseline * np.array([1.0, *(_LOOSE_SHARE * rng.standard_normal(2))]))

@@ -94,7 +94,6 @@ class Shader:
         facets: all facets, in the frame of their mover.
         body, mover: (F,) int of each facet.
         materials: of each body.
-        lights: of the scene.
         sky: its radiance.
         device: where shading runs.
     """

@@ -65,7 +65,6 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
 
     Args:
         out: run folder.
-        config: of the run.
         workers: processes that make pairs.
     Raises:
         InputError: the folder holds a run of another configuration, or something else.
