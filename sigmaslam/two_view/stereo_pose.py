@@ -110,7 +110,7 @@ def foresee(
         (M, 3) (u, v, disparity) there, their covariances (M, 3, 3), and whether (M,) each is inside the image.
     """
     predicted, front, by_pose, by_landmark = _project(camera, landmarks, se3_inverse(relative.T_key_camera))
-    covariance = by_pose @ relative.covariance @ by_pose.transpose(0, 2, 1) + _spread(by_landmark, landmark_sigma)
+    covariance = by_pose @ relative.covariance @ by_pose.transpose(0, 2, 1) + _propagated(by_landmark, landmark_sigma)
     u, v = predicted[:, 0], predicted[:, 1]
     return predicted, covariance, front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
 
@@ -196,7 +196,7 @@ class _StereoMatches:
         Unknown components, and points behind the camera, have zero information.
         """
         predicted, front, by_pose, by_landmark = _project(self.camera, self.landmarks, T_camera_key)
-        spread = self.noise + _spread(by_landmark, self.landmark_sigma)
+        spread = self.noise + _propagated(by_landmark, self.landmark_sigma)
         residual = self.measurement - predicted
         measured = np.isfinite(residual) & front[:, None]
         present = measured[:, :, None] & measured[:, None, :]
@@ -255,7 +255,7 @@ def _project(
     return predicted, front, by_pose, by_landmark
 
 
-def _spread(by: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+def _propagated(by: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Covariance (M, 3, 3) by derivatives (M, 3, 3) of what has standard deviations (M, 3)."""
     return (by * (sigma**2)[:, None, :]) @ by.transpose(0, 2, 1)
 
