@@ -32,7 +32,6 @@ def read_bytes(path: Path, limit: int, what: str, error: type[InputError] = Inpu
         path: file or link to one. A pipe or a device, which may never end, is refused before it is read.
         limit: bytes; larger files are refused.
         what: the file should be, for the message, such as "the trajectory".
-        error: to raise.
     Raises:
         InputError: the file is missing, larger, no regular file, or may not be read.
     """
@@ -128,7 +127,6 @@ def load_arrays(path: Path, mend: str, names: Collection[str] | None = None) -> 
     The sizes that the archive and the arrays' headers state are checked before any memory is taken.
 
     Args:
-        path: of the archive.
         mend: what to do about a bad one, for the message.
         names: of the arrays to read; None: all.
     Raises:

@@ -1,7 +1,5 @@
 """Colours and axes of every figure, and what to say where matplotlib is not installed."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -25,7 +23,7 @@ def has_matplotlib() -> bool:
     return True
 
 
-def style_axes(axes: Axes) -> None:
+def style_axes(axes: "Axes") -> None:
     """Draw a light grid, and no frame at the top and right."""
     axes.grid(True, color="#D9D9D9", lw=0.6)
     axes.set_axisbelow(True)

@@ -1,7 +1,5 @@
 """The progress of everything that takes long, on the standard error: a bar, or lines where there is no terminal."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,8 +21,8 @@ def counted(title: str, total: int | None) -> Iterator[Callable[[], None]]:
         yield lambda: progress.update(task, advance=1)
 
 
-def open_progress(hidden: bool = False, console: Console | None = None, line_every: float = LINE_EVERY) -> Progress:
-    """Tasks with a field `note`, behind the bar and the time that is left; nothing is shown where it is hidden.
+def open_progress(hidden: bool = False, console: "Console | None" = None, line_every: float = LINE_EVERY) -> "Progress":
+    """Tasks with a field `note`, behind the bar and the time that is left.
 
     Args:
         hidden: nothing is shown.
@@ -39,7 +37,7 @@ def open_progress(hidden: bool = False, console: Console | None = None, line_eve
 
         _said = time.monotonic()
 
-        def update(self, task_id: TaskID, *args: float, **fields: object) -> None:
+        def update(self, task_id: "TaskID", *args: float, **fields: object) -> None:
             super().update(task_id, *args, **fields)  # type: ignore[arg-type]
             now = time.monotonic()
             if hidden or self.console.is_terminal or self.console.is_jupyter or now - self._said < line_every:

@@ -34,6 +34,11 @@ class Table:
         return cls(*(_concatenate(columns) for columns in zip(*(part.columns() for part in parts), strict=True)))
 
 
+def even_rows(count: int, most: int) -> np.ndarray:
+    """Indices of an even selection of at most so many of `count` rows, the first and the last included."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.int64))
+
+
 def _select(column: Any, index: np.ndarray) -> Any:
     if column is None:
         return None

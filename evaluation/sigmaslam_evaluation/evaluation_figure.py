@@ -1,7 +1,5 @@
 """The figure of an evaluation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -27,7 +25,7 @@ def draw_evaluation(
     truth: Trajectory,
     covariance: np.ndarray | None = None,
     predicted: np.ndarray | None = None,
-) -> Figure:
+) -> "Figure":
     """View from above, height, errors over time with 3 sigma, and segment errors.
 
     Args:
@@ -89,7 +87,7 @@ def draw_evaluation(
     return figure
 
 
-def _draw_segments(panel: Axes, lengths: np.ndarray, by_length: np.ndarray, mean: float) -> None:
+def _draw_segments(panel: "Axes", lengths: np.ndarray, by_length: np.ndarray, mean: float) -> None:
     panel.set_title("Segment errors", fontsize=10)
     if len(lengths) == 0:
         panel.text(0.5, 0.5, "path shorter than a segment", ha="center", va="center", transform=panel.transAxes)
@@ -116,7 +114,7 @@ def view_axes(positions: np.ndarray) -> tuple[int, int, int]:
 
 
 def plot_trajectory(
-    axes: Axes, trajectories: Mapping[str, Trajectory], predicted: Mapping[str, np.ndarray] | None = None
+    axes: "Axes", trajectories: Mapping[str, Trajectory], predicted: Mapping[str, np.ndarray] | None = None
 ) -> tuple[int, int, int]:
     """Draw trajectories from above, with equal scales and a mark where each begins; dashed where they are guesses.
 

@@ -1,7 +1,5 @@
 """Consistency of relative poses as text, figure and plain numbers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -38,7 +36,7 @@ def format_relative(spans: tuple[SpanConsistency, ...] | None) -> list[str]:
     return lines
 
 
-def draw_relative(left: Axes, right: Axes, spans: tuple[SpanConsistency, ...]) -> None:
+def draw_relative(left: "Axes", right: "Axes", spans: tuple[SpanConsistency, ...]) -> None:
     """NEES of relative poses within their band, and errors beside what the covariances say of them."""
     places = np.arange(len(spans))
     low, high = CHI_SQUARE_BAND_OF_6 / 6

@@ -155,13 +155,11 @@ def check_update(
             raise ValueError(f"{kind}.mask is {tuple(measurement.mask.shape)}, but the value has {m} components")
         _check_batch(f"{kind}.mask", measurement.mask.shape[:-1], belief.batch_shape)
     _check_batch("the value", value.shape[:-1], belief.batch_shape)
-    batch = belief.batch_shape if value.shape[:-1] == belief.batch_shape else _joined(value, belief)
+    batch = belief.batch_shape
+    if value.shape[:-1] != batch:
+        batch = torch.broadcast_shapes(batch, value.shape[:-1])
     _check_batch(f"{kind}.noise", variance.shape[:-1], batch)
     return batch
-
-
-def _joined(value: Tensor, belief: Gaussian) -> torch.Size:
-    return torch.broadcast_shapes(belief.batch_shape, value.shape[:-1])
 
 
 def _check_batch(name: str, given: torch.Size, expected: torch.Size) -> None:

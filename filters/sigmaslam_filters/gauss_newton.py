@@ -5,8 +5,6 @@ equations, which lose half of the digits, are never formed. A prior is whitened 
 L L^T = P, zeta ~ N(0, I), so that P is not inverted and may hold directions that are known exactly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -63,7 +61,7 @@ class Term:
         difference = self.value - predicted if compare is None else compare(self.value, predicted)
         return self._whiten(difference.unsqueeze(-1)).squeeze(-1)
 
-    def linearised(self, problem: LeastSquares, anchor: Tensor, zeta: Tensor) -> Tensor:
+    def linearised(self, problem: "LeastSquares", anchor: Tensor, zeta: Tensor) -> Tensor:
         """Whitened derivative by zeta, with the whitened residual as one more column, (..., m, n + 1)."""
         shift = apply(problem.root, zeta)
         state = problem.retract(anchor, shift)

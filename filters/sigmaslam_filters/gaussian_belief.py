@@ -1,7 +1,5 @@
 """A Gaussian belief over states, by its covariance or by a square root of it, and how much of a belief it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -126,15 +124,15 @@ class Gaussian:
         """Leading dimensions."""
         return self.mean.shape[:-1]
 
-    def __getitem__(self, index: Any) -> Gaussian:
+    def __getitem__(self, index: Any) -> "Gaussian":
         """Elements of the batch: `belief[3]`, `belief[:, -1]`."""
         return self._like(self.mean[_of_batch(index, 1)], lambda matrix: matrix[_of_batch(index, 2)])
 
-    def expand(self, batch: Sequence[int]) -> Gaussian:
+    def expand(self, batch: Sequence[int]) -> "Gaussian":
         """The same belief in every element of a larger batch."""
         return self._like(self.mean.expand(*batch, -1), lambda matrix: matrix.expand(*batch, -1, -1))
 
-    def where(self, chosen: Tensor, other: Gaussian) -> Gaussian:
+    def where(self, chosen: Tensor, other: "Gaussian") -> "Gaussian":
         """This belief where chosen (...,) bool is true, the other elsewhere; held as this one is."""
         if other.batch_shape != self.batch_shape:
             other = other.expand(self.batch_shape)
@@ -150,11 +148,11 @@ class Gaussian:
             mixed._unrooted = other.covariance
         return mixed
 
-    def to(self, *arguments: Any, **options: Any) -> Gaussian:
+    def to(self, *arguments: Any, **options: Any) -> "Gaussian":
         """Another dtype or device, as `Tensor.to`."""
         return self._like(self.mean.to(*arguments, **options), lambda matrix: matrix.to(*arguments, **options))
 
-    def batch_last(self) -> Gaussian:
+    def batch_last(self) -> "Gaussian":
         """The same belief with batch-last memory: `mean[..., i]` is contiguous, and large batches run much faster."""
         return self._like(_with_batch_last_memory(self.mean, 1), lambda matrix: _with_batch_last_memory(matrix, 2))
 
@@ -165,14 +163,14 @@ class Gaussian:
         points, offsets = self.mean.expand(number, *self.mean.shape), apply(self.factor, normal)
         return points + offsets if space is None else space.retract(points, offsets)
 
-    def marginal(self, components: Sequence[int]) -> Gaussian:
+    def marginal(self, components: Sequence[int]) -> "Gaussian":
         """The belief about some components of a state in R^n, in that order."""
         kept = self._components(components)
         if self._covariance is not None:
             return Gaussian(self.mean[..., kept], self._covariance[..., kept, :][..., kept], is_symmetric=True)
         return Gaussian(self.mean[..., kept], factor=self.factor[..., kept, :])
 
-    def conditional(self, components: Sequence[int], values: Tensor) -> Gaussian:
+    def conditional(self, components: Sequence[int], values: Tensor) -> "Gaussian":
         """The belief about the other components of a state in R^n, in their order, once some are known.
 
         Args:
@@ -197,7 +195,7 @@ class Gaussian:
             raise ValueError(f"components {found} are not all different")
         return found
 
-    def _like(self, mean: Tensor, change: Callable[[Tensor], Tensor]) -> Gaussian:
+    def _like(self, mean: Tensor, change: Callable[[Tensor], Tensor]) -> "Gaussian":
         """With another mean, and the covariance or root changed; what has no root changes likewise."""
         if self._covariance is not None:
             return Gaussian(mean, change(self._covariance), is_symmetric=True)

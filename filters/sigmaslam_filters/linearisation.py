@@ -1,7 +1,5 @@
 """A motion or a measurement, linearised: what a filter's transform makes of a model at a belief."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -44,7 +42,7 @@ class LinearisedMeasurement:
     error: _Error | None = None
     usable: Tensor | None = None
 
-    def masked(self, mask: Tensor, unit_noise: bool) -> LinearisedMeasurement:
+    def masked(self, mask: Tensor, unit_noise: bool) -> "LinearisedMeasurement":
         """With nothing of the components where the mask (..., m) is False, see `Columns.masked`."""
         innovation = torch.where(mask, self.innovation, 0.0)
         return replace(self, innovation=innovation, columns=self.columns.masked(mask, unit_noise))

@@ -1,7 +1,5 @@
 """Motions and measurements as objects: a function, its noise, and how its values are compared."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -181,12 +179,12 @@ class LinearMeasurement:
         return apply(self.matrix, state)
 
 
-def is_additive(model: AnyMotion | AnyMeasurement) -> bool:
+def is_additive(model: "AnyMotion | AnyMeasurement") -> bool:
     """Whether the model's noise is added to what its function returns."""
     return isinstance(model, LinearMotion | LinearMeasurement) or model.additive
 
 
-def several(measurement: AnyMeasurement, count: int) -> AnyMeasurement:
+def several(measurement: "AnyMeasurement", count: int) -> "AnyMeasurement":
     """The measurement taken `count` times at one time, of what its inputs name: landmarks, beacons.
 
     Values are (..., count m), end to end, and inputs (..., count, ·); each has the noise of its own, independent of

@@ -13,8 +13,6 @@ unit:
   (Agamennoni et al. 2012; Piché et al. 2012), iterated reweighting for Huber's loss.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -78,7 +76,7 @@ class Blocks:
     @classmethod
     def of(
         cls, measurement: AnyMeasurement, noise: Noise, value: Tensor, mask: Tensor | None, robust: Robust | None
-    ) -> Blocks:
+    ) -> "Blocks":
         """The blocks of a value (..., m), as the model cuts it, else a `BlockDiagonal` noise; else there is one.
 
         Raises:
@@ -98,7 +96,7 @@ class Blocks:
         count = present.unflatten(-1, (-1, size)).sum(dim=-1)
         return cls(size, alone, count, torch.ones_like(count, dtype=value.dtype), robust)
 
-    def gated(self, gate: float, innovation: Tensor, columns: Columns, noise: Noise) -> Blocks:
+    def gated(self, gate: float, innovation: Tensor, columns: Columns, noise: Noise) -> "Blocks":
         """The blocks with the weights that a gate gives them.
 
         Args:

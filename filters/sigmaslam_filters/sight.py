@@ -1,7 +1,5 @@
 """A measurement of a belief on its way through an update: look, gate, solve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,7 +19,6 @@ class Sight:
 
     Attributes:
         linearisation: how it is linearised.
-        measurement: the model.
         inputs: of the model's function.
         value: (..., m), zero for what is missing.
         mean, root: (..., p), (..., n, n) of the prior belief.
@@ -65,7 +62,7 @@ class Sight:
 
     def gated(
         self, seen: LinearisedMeasurement, gate: float | None, robust: Robust | None
-    ) -> tuple[Sight, LinearisedMeasurement]:
+    ) -> "tuple[Sight, LinearisedMeasurement]":
         """Without the blocks that the gate refuses, in what is looked at and in what was seen."""
         if gate is None and robust is None:
             return self, seen

@@ -1,7 +1,5 @@
 """Whole sequences: filtering, and Rauch-Tung-Striebel smoothing by square roots, on manifolds too."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -81,7 +79,7 @@ class Track:
     __repr__ = shapes_of
 
     @classmethod
-    def of(cls, prior: Gaussian, steps: Sequence[tuple[TimeUpdate | None, Update | None]]) -> Track:
+    def of(cls, prior: Gaussian, steps: Sequence[tuple[TimeUpdate | None, Update | None]]) -> "Track":
         """The track of a loop of one's own, which can be smoothed.
 
         Args:

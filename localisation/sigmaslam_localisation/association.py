@@ -123,11 +123,8 @@ class Association:
         self._bayes: BayesFilter = make_filter(name, SPACE)
         if places is None:
             mapper = MappingRobot.of_robot(robot, 0, start)
-            self._platform, self._bayes, self._belief = (
-                mapper,
-                make_filter(name, mapper.space),
-                mapper.enter(self._belief),
-            )
+            self._platform, self._bayes = mapper, make_filter(name, mapper.space)
+            self._belief = mapper.enter(self._belief)
 
     def run(self, tell: Callable[[float], None]) -> None:
         """Goes through all steps."""
@@ -198,8 +195,7 @@ class Association:
         residual = self._robot.measurement().residual
         if residual is None:
             return value - expected
-        difference: np.ndarray = residual(torch.from_numpy(value), torch.from_numpy(expected)).numpy()
-        return difference
+        return np.asarray(residual(torch.from_numpy(value), torch.from_numpy(expected)))
 
 
 def associate(

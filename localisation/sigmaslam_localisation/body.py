@@ -1,7 +1,5 @@
 """A body with a stereo camera among known points: localised, scored and written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,8 +53,8 @@ class BodyEstimate:
     scale: np.ndarray
     delay: float
     truth: np.ndarray | None
-    smoothed: BodyEstimate | None = None
-    lagged: BodyEstimate | None = None
+    smoothed: "BodyEstimate | None" = None
+    lagged: "BodyEstimate | None" = None
 
 
 def localise_body(
@@ -176,7 +174,7 @@ def _trajectory(estimates: Sequence[BodyEstimate]) -> Iterable[str]:
             yield f"{estimate.name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
 
 
-def _draw(recording: StereoRecording, estimate: BodyEstimate, png: Path) -> list[tuple[str, str, Figure]]:
+def _draw(recording: StereoRecording, estimate: BodyEstimate, png: Path) -> "list[tuple[str, str, Figure]]":
     if not has_matplotlib():
         return []
     figure, axes = draw_axes(6, "x [m]", "y [m]")

@@ -1,7 +1,5 @@
 """The report of a localisation: one HTML file without links to anything outside it."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Mapping, Sequence
@@ -28,12 +26,11 @@ SIGMAS = 3.0
 
 
 def write_page(
-    path: Path, name: str, summaries: Mapping[str, Mapping[str, Any]], figures: Sequence[tuple[str, str, Figure]]
+    path: Path, name: str, summaries: Mapping[str, Mapping[str, Any]], figures: "Sequence[tuple[str, str, Figure]]"
 ) -> None:
     """Write the page.
 
     Args:
-        path: the file.
         name: of the recording.
         summaries: by robot, label and value.
         figures: title, caption and figure of each.
@@ -59,7 +56,9 @@ def write_page(
     atomic_write_text(path, text)
 
 
-def draw_robots(estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: Path) -> list[tuple[str, str, Figure]]:
+def draw_robots(
+    estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: Path
+) -> "list[tuple[str, str, Figure]]":
     """The map, also as a PNG, and innovations over time; nothing without matplotlib."""
     if not has_matplotlib():
         return []
@@ -84,7 +83,7 @@ def draw_robots(estimates: Sequence[RobotEstimate], landmarks: np.ndarray, png: 
     return drawn
 
 
-def draw_axes(height: float, x: str, y: str) -> tuple[Figure, Axes]:
+def draw_axes(height: float, x: str, y: str) -> "tuple[Figure, Axes]":
     """A figure of eight inches and so many, and its axes with these labels."""
     from matplotlib.figure import Figure
 
@@ -96,7 +95,7 @@ def draw_axes(height: float, x: str, y: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _draw_map(axes: Axes, estimates: Sequence[RobotEstimate], landmarks: np.ndarray) -> None:
+def _draw_map(axes: "Axes", estimates: Sequence[RobotEstimate], landmarks: np.ndarray) -> None:
     for estimate, colour in zip(estimates, _colours(estimates), strict=True):
         if estimate.truth is not None:
             axes.plot(*estimate.truth.poses[:, :2].T, color=GREY, lw=0.5, rasterized=True)
@@ -115,7 +114,7 @@ def _draw_map(axes: Axes, estimates: Sequence[RobotEstimate], landmarks: np.ndar
     axes.legend(loc="best", fontsize=8)
 
 
-def _draw_ellipse(axes: Axes, centre: np.ndarray, covariance: np.ndarray, colour: str) -> None:
+def _draw_ellipse(axes: "Axes", centre: np.ndarray, covariance: np.ndarray, colour: str) -> None:
     from matplotlib.patches import Ellipse
 
     variances, directions = np.linalg.eigh(covariance)
@@ -135,7 +134,7 @@ def _cell(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _to_svg(figure: Figure, name: str) -> str:
+def _to_svg(figure: "Figure", name: str) -> str:
     """The figure as an `<svg>` element to put into a page; the same figure gives the same text.
 
     Args:

@@ -67,7 +67,6 @@ def localise(
     """Filter all robots at once.
 
     Args:
-        bayes: the filter.
         platform: models of the robots. The first sightings of a `MappingRobot` go into its map and update nothing.
         prior: (B,) beliefs at the start.
         steps: (K, B) motions and sightings.

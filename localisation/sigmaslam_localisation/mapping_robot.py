@@ -11,8 +11,6 @@ different estimates add up to information that no sighting gave (Julier and Uhlm
 seen is the same tangent at all estimates, as in the invariant filter of Barrau and Bonnabel (2015).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -110,14 +108,14 @@ class MappingRobot(WheeledRobot):
     origin: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of_robot(cls, robot: WheeledRobot, landmarks: int, poses: Tensor) -> MappingRobot:
+    def of_robot(cls, robot: WheeledRobot, landmarks: int, poses: Tensor) -> "MappingRobot":
         """The robot with so many landmarks, near its first poses (B, 3)."""
         x, y, _ = poses.mean(dim=0).tolist()
         return cls(robot.kind, robot.lever, robot.noise, landmarks, (x, y))
 
     @property
     def space(self) -> MapSpace:
-        """Of the state."""
+        """Of the state: the robot's pose and constants, then the places of the landmarks."""
         return MapSpace(self.lever, self.landmarks, self.origin)
 
     def enter(self, alone: Gaussian) -> Gaussian:

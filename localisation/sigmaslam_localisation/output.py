@@ -66,9 +66,10 @@ def write_robots(
     settings: Mapping[str, Any],
 ) -> dict[str, dict[str, Any]]:
     """Write all files of robots into a folder that is there; returns as `write_run`."""
-    _write_innovations(folder / "innovations.csv", second)
+    write_lines(folder / "innovations.csv", _innovations(second))
     if any(estimate.map is not None for estimate in second):
-        _write_maps(folder / "landmarks.csv", second, max((each.landmark_names for each in recordings), key=len))
+        names = max((each.landmark_names for each in recordings), key=len)
+        write_lines(folder / "landmarks.csv", _maps(second, names))
     figures = draw_robots(second, recordings[0].landmarks, folder / "map.png")
     return write_run(folder, name, settings, first, second, _trajectory, summarise, figures)
 
@@ -104,36 +105,26 @@ def _trajectory(estimates: Sequence[RobotEstimate]) -> Iterable[str]:
             yield f"{estimate.name},{second:.6f},{','.join(f'{number:.9g}' for number in numbers)},{seen}"
 
 
-def _write_innovations(path: Path, estimates: Sequence[RobotEstimate]) -> None:
+def _innovations(estimates: Sequence[RobotEstimate]) -> Iterable[str]:
     """Each sighting: the index of the landmark, the innovation's components, its NIS and its robust weight."""
     components = estimates[0].innovation.shape[-1]
-
-    def lines() -> Iterable[str]:
-        yield f"robot,time,landmark,{','.join(f'innovation_{i}' for i in range(components))},nis,weight"
-        for estimate in estimates:
-            for row, slot in zip(*np.nonzero(np.isfinite(estimate.nis)), strict=True):
-                numbers = [*estimate.innovation[row, slot], estimate.nis[row, slot], estimate.weight[row, slot]]
-                yield (
-                    f"{estimate.name},{estimate.seconds[row]:.6f},{estimate.seen[row, slot]},"
-                    f"{','.join(f'{number:.6g}' for number in numbers)}"
-                )
-
-    write_lines(path, lines())
+    yield f"robot,time,landmark,{','.join(f'innovation_{i}' for i in range(components))},nis,weight"
+    for estimate in estimates:
+        for row, slot in zip(*np.nonzero(np.isfinite(estimate.nis)), strict=True):
+            numbers = [*estimate.innovation[row, slot], estimate.nis[row, slot], estimate.weight[row, slot]]
+            cells = ",".join(f"{number:.6g}" for number in numbers)
+            yield f"{estimate.name},{estimate.seconds[row]:.6f},{estimate.seen[row, slot]},{cells}"
 
 
-def _write_maps(path: Path, estimates: Sequence[RobotEstimate], names: Sequence[str]) -> None:
+def _maps(estimates: Sequence[RobotEstimate], names: Sequence[str]) -> Iterable[str]:
     """Places that the robots found, metres, and their covariances."""
-
-    def lines() -> Iterable[str]:
-        yield "robot,landmark,x,y,cov_xx,cov_xy,cov_yy"
-        for estimate in estimates:
-            found = estimate.map
-            assert found is not None
-            for row, (landmark, (x, y)) in enumerate(zip(found.landmark, found.place, strict=True)):
-                (xx, xy), (_, yy) = found.covariance[2 * row : 2 * row + 2, 2 * row : 2 * row + 2]
-                yield f"{estimate.name},{names[landmark]},{','.join(f'{each:.9g}' for each in (x, y, xx, xy, yy))}"
-
-    write_lines(path, lines())
+    yield "robot,landmark,x,y,cov_xx,cov_xy,cov_yy"
+    for estimate in estimates:
+        found = estimate.map
+        assert found is not None
+        for row, (landmark, (x, y)) in enumerate(zip(found.landmark, found.place, strict=True)):
+            (xx, xy), (_, yy) = found.covariance[2 * row : 2 * row + 2, 2 * row : 2 * row + 2]
+            yield f"{estimate.name},{names[landmark]},{','.join(f'{each:.9g}' for each in (x, y, xx, xy, yy))}"
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:

@@ -1,7 +1,5 @@
 """What a robot recorded: commands or odometry, sightings of landmarks, and the truth if there is one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,7 +69,7 @@ class Recording:
         """Of the landmarks, in the order of their indices."""
         return tuple(map(str, range(len(self.landmarks)))) if self.names is None else self.names
 
-    def within(self, largest_range: float) -> Recording:
+    def within(self, largest_range: float) -> "Recording":
         """The recording without sightings from further away, metres."""
         distance = self.sightings[:, 0] if self.kind == "range-bearing" else np.hypot(*self.sightings.T)
         near = distance <= largest_range

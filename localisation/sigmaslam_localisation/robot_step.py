@@ -21,7 +21,6 @@ class RobotStep:
     """What a robot does and sees, as a function of tensors that may have a batch.
 
     Attributes:
-        bayes: the filter.
         platform: models of the robot.
         slots: sightings that there may be at a time; 0 for a step that only moves.
     """

@@ -1,7 +1,5 @@
 """Robots of a recording, localised in two passes: the first finds delay, constants and noise, the second uses them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -75,8 +73,8 @@ class RobotEstimate:
     scale: np.ndarray
     truth: PlanarTruth | None
     map: LandmarkMap | None = None
-    smoothed: RobotEstimate | None = None
-    lagged: RobotEstimate | None = None
+    smoothed: "RobotEstimate | None" = None
+    lagged: "RobotEstimate | None" = None
 
 
 def localise_robots(
@@ -109,7 +107,7 @@ def localise_robots(
     starts = first_poses(recordings, steps.seconds[0, ::count], start)
     robot = WheeledRobot.of(recordings[0])
     prior = robot.prior(starts)
-    repeated = _pick(prior, torch.arange(len(recordings)).repeat_interleave(count))
+    repeated = prior[torch.arange(len(recordings)).repeat_interleave(count)]
     platform: Platform = robot
     space: Space = SPACE
     if mapping:
@@ -123,7 +121,7 @@ def localise_robots(
     at_first = _estimates(recordings, delays, steps, first, chosen, space)
 
     steps = make_steps(recordings, delays)
-    prior = _with_constants(prior, _pick(first.final, torch.from_numpy(chosen)))
+    prior = _with_constants(prior, first.final[torch.from_numpy(chosen)])
     prior = mapper.enter(prior) if mapping else prior
     scale = torch.from_numpy(first.scale[-1, chosen])
     second = localise(
@@ -170,18 +168,12 @@ def first_poses(
     return torch.from_numpy(np.stack(poses))
 
 
-def _pick(belief: Gaussian, index: Tensor) -> Gaussian:
-    return Gaussian(belief.mean[index], belief.covariance[index])
-
-
 def _with_constants(prior: Gaussian, known: Gaussian) -> Gaussian:
     """The prior's poses, and the constants as they are known."""
     mean, covariance = prior.mean.clone(), prior.covariance.clone()
     constants = slice(BODY.point_size, ROBOT_SIZE)
-    mean[:, constants], covariance[:, constants, constants] = (
-        known.mean[:, constants],
-        known.covariance[:, constants, constants],
-    )
+    mean[:, constants] = known.mean[:, constants]
+    covariance[:, constants, constants] = known.covariance[:, constants, constants]
     return Gaussian(mean, covariance)
 
 

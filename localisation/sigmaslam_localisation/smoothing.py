@@ -9,8 +9,6 @@ where x_f, x_p and the derivative A of local(x_p, retract(x_f, s)) by s, at zero
 out is of the second order in s and the first in the innovation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,7 +29,6 @@ class Smoother:
     """One robot's steps, ready for recursions backwards in time.
 
     Attributes:
-        space: of the states.
         mean: (K + 1, p) filtered.
         covariance: (K + 1, n, n) filtered.
         gain: (K, n, n) G.
@@ -49,11 +46,10 @@ class Smoother:
     conditional: np.ndarray
 
     @classmethod
-    def of(cls, space: Space, filtered: Gaussian, moved: TimeUpdate) -> list[Smoother]:
+    def of(cls, space: Space, filtered: Gaussian, moved: TimeUpdate) -> "list[Smoother]":
         """Of each robot.
 
         Args:
-            space: of the states.
             filtered: (K + 1, B) beliefs.
             moved: (K, B) what `BayesFilter.predict` makes of all but the last of them.
         """
@@ -65,7 +61,7 @@ class Smoother:
     @classmethod
     def _of_one(
         cls, space: Space, mean: Tensor, covariance: Tensor, predicted: Tensor, spread: Tensor, cross: Tensor
-    ) -> Smoother:
+    ) -> "Smoother":
         # In units of the predicted deviations, as metres and shares differ by orders of magnitude.
         deviation = torch.diagonal(spread, dim1=-2, dim2=-1).sqrt()
         units = deviation[:, :, None] * deviation[:, None, :]

@@ -25,7 +25,6 @@ class StereoRecording:
         seconds: (K + 1,) times of its frames.
         rates: (K + 1, 6) speeds and turn rates of the body in its own frame, m/s, rad/s.
         pixels: (K + 1, M, 4) columns and rows of the points on the left, then on the right; negative for none.
-        rig: its camera.
         points: (M, 3) in the world, metres.
         truth: (K + 1, 7) translation and quaternion x, y, z, w of the body in the world, or None.
     """

@@ -78,7 +78,6 @@ class StereoBody:
     """Models of a body whose stereo camera sees known points.
 
     Attributes:
-        rig: the camera.
         noise: standard deviations.
     """
 

@@ -12,8 +12,6 @@ The state is the pose on SE(2), then nine constants that the filter estimates on
 | sensor ahead, sensor left | m | where the sensor stands, beside where it is said to |
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -67,7 +65,7 @@ class WheeledRobot:
     noise: RobotNoise = RobotNoise()
 
     @classmethod
-    def of(cls, recording: Recording) -> WheeledRobot:
+    def of(cls, recording: Recording) -> "WheeledRobot":
         """The robot that made a recording."""
         return cls(recording.kind, recording.lever)
 

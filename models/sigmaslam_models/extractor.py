@@ -54,11 +54,8 @@ class FeatureExtractor(nn.Module):
         quality = sample_map(maps.quality, candidates).squeeze(-1).sigmoid()
         strength = strength / strength.amax(dim=1, keepdim=True).clamp_min(1e-12)
         sigma = sample_map(maps.log_sigma, candidates).squeeze(-1).exp()
-        scores, order = self._rank(strength, quality, sigma).topk(count, dim=1)
+        # Relative strength of the blob and learned quality count alike; of strength zero is no blob.
+        scores, order = (strength.sqrt() * quality).topk(count, dim=1)
         keypoints = candidates.gather(1, order.unsqueeze(-1).expand(-1, -1, 2))
         descriptors = self.network.describe(maps, keypoints)
         return keypoints[0], scores[0], descriptors[0], sigma.gather(1, order)[0]
-
-    def _rank(self, strength: Tensor, quality: Tensor, sigma: Tensor) -> Tensor:
-        """Scores (B, N). Relative strength of the blob and learned quality count alike; of strength zero is no blob."""
-        return strength.sqrt() * quality

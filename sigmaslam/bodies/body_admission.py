@@ -41,10 +41,7 @@ class BodyAdmission:
     """Admits the features of a body.
 
     Args:
-        camera: the rectified pair.
         region: (H, W) bool, where the body is in the first rectified left image.
-        frontend: matches features.
-        config: of the tracker.
 
     Attributes:
         T_camera_body: (4, 4) the body's frame in the first rectified camera, whose axes it has.

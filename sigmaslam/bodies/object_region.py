@@ -69,11 +69,7 @@ def inner_half(region: np.ndarray) -> np.ndarray:
 
 
 class BodyShape:
-    """Points that have moved with the body, and where it must be in an image because of them.
-
-    Args:
-        camera: the rectified pair.
-    """
+    """Points that have moved with the body, and where it must be in an image because of them."""
 
     def __init__(self, camera: RectifiedStereo) -> None:
         self._camera = camera

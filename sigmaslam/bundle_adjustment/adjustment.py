@@ -100,7 +100,6 @@ def adjust(
         tracks: the observations.
         poses: (N, 4, 4) T_world_camera of all frames, as tracked.
         covariances: (N, 6, 6) of the poses; only their growth over gaps in the tracks is used.
-        config: settings.
         tell: receives messages on the progress.
     Raises:
         InputError: gtsam is not installed, there is nothing to adjust, or the tracks do not fix all poses.

@@ -28,15 +28,12 @@ _LOGGER = logging.getLogger(__name__)
 _COUNTS = ("observations", "outliers", "far_landmarks", "bridges", "iterations", "solves", "converged", "dof")
 
 
-def refine_run(
-    run: Path, out: Path, config: RefineConfig | None = None, tell: Callable[[str], None] = lambda note: None
-) -> dict[str, Any]:
+def refine_run(run: Path, out: Path, tell: Callable[[str], None] = lambda note: None) -> dict[str, Any]:
     """Bundle adjustment of the tracks of a run; writes trajectory, covariance, map and refine.json.
 
     Args:
         run: folder of `sigmaslam track --tracks`; the adjustment begins at its `trajectory_final.tum` if there is one.
         out: folder, new or empty.
-        config: settings.
         tell: receives messages on the progress.
     Returns:
         The content of refine.json.
@@ -44,7 +41,7 @@ def refine_run(
         InputError: gtsam is not installed, a file of the run is missing or wrong, or `out` holds something.
     """
     load_gtsam()
-    config = config or RefineConfig()
+    config = RefineConfig()
     began = time.perf_counter()
     check_has_trajectory(run)
     check_new_folder(out)

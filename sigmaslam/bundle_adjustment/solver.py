@@ -50,7 +50,6 @@ class Bridge:
     """The tracker's motion between two keyframes, where the tracks break off.
 
     Attributes:
-        i, j: the keyframes.
         T_i_j: (4, 4) takes j to i, metres.
         covariance: (6, 6) of x in T_i_j exp(x), x = (translation, rotation).
     """

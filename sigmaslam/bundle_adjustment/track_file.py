@@ -49,7 +49,6 @@ def read_tracks(path: Path, frames: int) -> Tracks:
     """Reads and checks tracks.npz.
 
     Args:
-        path: the file.
         frames: poses in the trajectory of the same run.
     Raises:
         InputError: there is no such file, it is truncated, or its content is wrong (the message says where).

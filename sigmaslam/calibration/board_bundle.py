@@ -83,7 +83,6 @@ class BoardBundle:
     """Rig and boards with what the corners say of the rig when all poses of the board are free.
 
     Attributes:
-        rig: the cameras.
         poses: (n, 4, 4) T_left_board.
         residuals: (N, 2) seen minus projected, pixels.
         information: (n, P, P) of each image about the rig, for corners with a sigma of 1 px.

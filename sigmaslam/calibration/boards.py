@@ -14,7 +14,7 @@ BOARD_FORMS = "chessboard:9x6:0.025, charuco:8x6:0.04:0.03:DICT_5X5_100 or april
 _WINDOW_SHARE, _MAX_WINDOW = 0.3, 11
 _REFINED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 # Of one image; fewer say hardly more than where the board is.
-_MIN_CORNERS = 6
+MIN_CORNERS = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class Charuco:
     def detect(self, image: np.ndarray) -> DetectedCorners:
         """Corners between two markers that were read."""
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(self.opencv).detectBoard(image)
-        if ids is None or len(ids) < _MIN_CORNERS:
+        if ids is None or len(ids) < MIN_CORNERS:
             return NOTHING
         ids, pixels = ids.ravel().astype(np.int64), pixels.reshape(-1, 2)
         # Markers come as near to a corner as the white rim around them.
@@ -136,7 +136,7 @@ class AprilGrid:
         quads, tags, _ = detector.detectMarkers(image)
         tags = np.zeros(0, np.int64) if tags is None else tags.ravel()
         read = [k for k, tag in enumerate(tags) if tag < self.columns * self.rows]
-        if 4 * len(read) < _MIN_CORNERS:
+        if 4 * len(read) < MIN_CORNERS:
             return NOTHING
         # OpenCV begins at the corner that is the bottom right of Kalibr's tag, and goes clockwise.
         ids = (4 * tags[read, None] + [1, 0, 3, 2]).ravel().astype(np.int64)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.calibration.board_bundle import BoardBundle, Corners, Rig, project_corners, solve_bundle
-from sigmaslam.calibration.boards import DetectedCorners
+from sigmaslam.calibration.boards import MIN_CORNERS, DetectedCorners
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel
 from sigmaslam.geometry.se3 import rigid_motion, rotation_log, se3_inverse
@@ -21,8 +21,6 @@ LENSES: dict[str, tuple[DistortionModel, int]] = {
 }
 """Lens models by their names on the command line, with the number of coefficients."""
 
-# Of one image; below, they say hardly more than where the board is.
-MIN_CORNERS = 6
 MIN_IMAGES = 3
 # An image with so many times the rms of the median image does not belong to this board; it is blurred or misread.
 OUTLIER_IMAGE = 3.0
@@ -51,7 +49,6 @@ class BoardCalibration:
     """A calibration with how well it is known.
 
     Attributes:
-        rig: the cameras.
         covariance: (P, P) of `rig.names`; pixels, coefficients, metres, radians.
         sigma: of a corner's coordinate, pixels.
         design_effect: by how much corners of one image that are wrong together enlarge the covariance.
@@ -61,7 +58,6 @@ class BoardCalibration:
         outlier_images: those that are not used.
         outlier_corners: single corners of these images that are not used.
         outlier_residuals: (K, 2) theirs, pixels.
-        bundle: the solution.
     """
 
     rig: Rig

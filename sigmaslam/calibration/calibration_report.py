@@ -1,7 +1,5 @@
 """A calibration from a board as a file, in words, and as a picture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -131,7 +129,7 @@ def draw_board_calibration(path: Path, result: BoardCalibration) -> None:
         figure.savefig(temporary, dpi=100)
 
 
-def _draw_corners(axes: Axes, result: BoardCalibration, k: int, eye: CameraModel) -> None:
+def _draw_corners(axes: "Axes", result: BoardCalibration, k: int, eye: CameraModel) -> None:
     mine = result.corners.eye == k
     (u, v), (du, dv) = result.corners.pixels[mine].T, result.residuals[mine].T
     axes.set(xlim=(-0.5, eye.width - 0.5), ylim=(eye.height - 0.5, -0.5), aspect="equal")

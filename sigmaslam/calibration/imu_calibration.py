@@ -8,8 +8,6 @@ poses, gyro and accelerometer are is estimated with the rest (variance component
 Photogrammetric Computer Vision, 2016, section 4.2.4).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -100,7 +98,7 @@ class _State:
     gravity: np.ndarray
     shift: float
 
-    def moved(self, steps: np.ndarray, shared: np.ndarray) -> _State:
+    def moved(self, steps: np.ndarray, shared: np.ndarray) -> "_State":
         """With steps (N, 15) of the images and (10,) of what they share."""
         T = self.T_left_imu.copy()
         T[:3, :3] = nearest_rotation(T[:3, :3] @ rotation_exp(shared[_ROTATION]))
@@ -126,7 +124,6 @@ def calibrate_imu(
 
     Args:
         path: of the left camera.
-        samples: of the sensor.
         sensor: its noise; mounting and time shift are where the search begins: the rotation may be anything.
         shared_errors: so many times fewer poses than there are have errors of their own.
         done: called after each of at most 25 rounds.

@@ -18,7 +18,6 @@ def write_calibration(path: Path, camera: StereoCamera, more: dict[str, Any] | N
 
     Args:
         path: of the YAML file.
-        camera: the calibration.
         more: further entries, which `from_yaml` leaves alone.
 
     Raises:

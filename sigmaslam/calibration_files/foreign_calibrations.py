@@ -26,7 +26,6 @@ def write_foreign_calibration(path: Path, camera: StereoCamera, form: str) -> No
 
     Args:
         path: of the file or folder.
-        camera: the calibration.
         form: of `FORMS`.
 
     Raises:

@@ -59,7 +59,6 @@ def write_kalibr(
     """Writes camchain-imucam.yaml of one camera or two; Kalibr itself knows radtan of four coefficients alone.
 
     Args:
-        path: of the file.
         eyes: left first.
         T_left_right: (4, 4), not used for one camera.
         sensor: with T_left_imu and time shift.

@@ -61,7 +61,6 @@ def judge_motion(
         times: (N,) seconds.
         poses: (N, 4, 4) T_world_camera of the left camera.
         tracked: (N,) bool, poses that come from images.
-        recording: the sensor.
     """
     both = np.flatnonzero(tracked[:-1] & tracked[1:])
     R, sensor = poses[:, :3, :3], recording.sensor
@@ -168,9 +167,10 @@ def _judge_forces(axes: np.ndarray | None) -> Finding:
 def _judge_mounting(
     fit: TurnFit, off: np.ndarray, axes: np.ndarray | None, of_forces: np.ndarray | None, inverse: np.ndarray
 ) -> Finding:
-    """Of the rotation in T_cam_imu: the sensor is turned by `off` (3, 3), or `inverse` if that were inverted.
+    """Of the rotation in T_cam_imu; `off` (3, 3) takes directions of the sensor as expected to the sensor as it is.
 
-    `axes` are nearest to that, `of_forces` the accelerometer's; None where they are not known.
+    `axes` are the signed permutation nearest to that, `of_forces` those of the accelerometer, each None where it is
+    not known; `inverse` is as `off`, if T_cam_imu were inverted.
     """
     right = np.linalg.det(off) > 0.0
     # A mirror is no rotation: determinant and all signs are changed first, for a number to show.

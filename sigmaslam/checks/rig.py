@@ -41,7 +41,6 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
 
     Args:
         matches: of pairs of one rig, rectified by `rectifier`.
-        rectifier: of the calibration.
         frame_interval: seconds from one frame to the next; None: unknown.
     """
     if len(matches) < MIN_MATCHES:
@@ -101,7 +100,7 @@ def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
     upright = fit_rows(stand_upright(matches), rectifier.rectified)
     columns = upright.agreement(ROW_TOLERANCE)
     shifted = abs(float(np.median(matches.row_difference))) > ROW_TOLERANCE
-    if shifted and columns > _EXPLAINED and _BETTER * _spread(upright.residual) < _spread(given.residual):
+    if shifted and columns > _EXPLAINED and _BETTER * _mad(upright.residual) < _mad(given.residual):
         message = (
             f"the cameras stand one above the other: {100 * columns:.0f} % of the matches lie in one column: turn "
             "images and calibration by 90 degrees"
@@ -126,13 +125,16 @@ def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
 
 
 def _check_distortion(matches: EyeMatches, rectifier: StereoRectifier) -> Finding:
-    """Whether images that the calibration undistorts are rectified already: then they have larger row differences."""
+    """Whether images that the calibration undistorts are rectified already.
+
+    A rectification that is right leaves smaller row differences than there were, whatever else is wrong.
+    """
     if rectifier.camera.is_rectified:
         return Finding("distortion", "ok", "the calibration is of rectified images")
     stored = leave_unrectified(matches, rectifier)
     if len(stored) < MIN_MATCHES:
         return Finding("distortion", "unknown", TOO_FEW)
-    before, after = (_spread(fit_rows(each, rectifier.rectified).residual) for each in (stored, matches))
+    before, after = (_mad(fit_rows(each, rectifier.rectified).residual) for each in (stored, matches))
     rows = float(np.median(np.abs(stored.row_difference)))
     # A median of absolute values is known to about one part in the root of their number.
     worse = after > before * (1.0 + SIGNIFICANT / np.sqrt(len(stored)))
@@ -153,7 +155,7 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
         )
     sigma = float(fit.sigmas[4])
     figure = f"{abs(fit.lag):.2f} ± {sigma:.2f} of a frame{_milliseconds(fit.lag, frame_interval)}"
-    explained = _spread(fit.residual) ** 2 < (1.0 - _LAG_SHARE) * _spread(fit.residual + fit.by_lag[:, 1]) ** 2
+    explained = _mad(fit.residual) ** 2 < (1.0 - _LAG_SHARE) * _mad(fit.residual + fit.by_lag[:, 1]) ** 2
     if fit.lag_shift < _WARN_LAG or not explained:
         return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
     message = (
@@ -191,7 +193,7 @@ def check_pairing(
     """
     view = rectifier.rectified
     scatter = {
-        frames: _spread(fit_rows(each.unfollowed(), view).residual)
+        frames: _mad(fit_rows(each.unfollowed(), view).residual)
         for frames, each in {0: matches, **shifted}.items()
         if len(each) >= MIN_MATCHES
     }
@@ -295,5 +297,6 @@ def _follows(matches: EyeMatches) -> float:
     return float((level & (matches.disparity > -1.0)).mean()) if len(matches) else 0.0
 
 
-def _spread(values: np.ndarray) -> float:
+def _mad(values: np.ndarray) -> float:
+    """Median absolute deviation."""
     return float(np.median(np.abs(values - np.median(values))))

@@ -1,7 +1,5 @@
 """`sigmaslam demo` and `sigmaslam track`."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from contextlib import suppress
@@ -246,7 +244,7 @@ def _read_request(options: dict[str, Any]) -> TrackRequest:
     return TrackRequest(build(InputOptions), build(OutputOptions), build(TrackerOptions), build(LiveOptions))
 
 
-def _read_settings(path: Path | None, estimate: str | None, track_object: bool) -> TrackerConfig | None:
+def _read_settings(path: Path | None, estimate: str | None, track_object: bool) -> "TrackerConfig | None":
     """Settings of a file and of the command line; None where neither says anything."""
     from sigmaslam.bodies.object_tracker import OBJECT_CONFIG
     from sigmaslam.slam.config import TrackerConfig, check_estimated, read_config

@@ -1,7 +1,5 @@
 """What `track` gives its frames to beside the run folder: a stream, a video, a viewer, a web page."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -77,7 +75,7 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
         raise typer.Exit(UNREAD)
 
 
-def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> RerunSink:
+def _open_viewer(viewer: str, out: Path, camera: StereoCamera) -> "RerunSink":
     name, colon, file = viewer.partition(":")
     is_url = name in ("rerun+http", "rerun+https") and file.startswith("//")
     if not is_url and (name != "rerun" or (colon and not file)):

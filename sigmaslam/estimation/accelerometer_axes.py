@@ -26,7 +26,6 @@ def fit_axes(times: np.ndarray, bodies: np.ndarray, samples: InertialSamples, sh
     Args:
         times: (N,) of the images, seconds; more than four, a few seconds in all, and at a rate to interpolate turns.
         bodies: (N, 4, 4) poses of the sensor, as the cameras have them.
-        samples: of the sensor.
         shift: its clock minus that of the camera, seconds.
     """
     t = samples.timestamp - shift

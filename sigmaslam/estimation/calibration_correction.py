@@ -1,7 +1,5 @@
 """A window corrects its calibration where evidence speaks, and offsets beyond their prior."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -20,7 +18,7 @@ _REACH = 0.5
 _BASELINE = np.array([ERRORS.index("baseline")])
 
 
-def change_rig(window: KeyframeWindow, offset: float) -> None:
+def change_rig(window: "KeyframeWindow", offset: float) -> None:
     """The right camera was bumped, and disparities are larger by an offset; no keyframe is in the window.
 
     The bump may have turned the camera, too.
@@ -39,7 +37,7 @@ def change_rig(window: KeyframeWindow, offset: float) -> None:
     window.evidence = CalibrationEvidence(turned, window.camera.fx, window.graphs.condition, window.expected)
 
 
-def judge_calibration(window: KeyframeWindow) -> None:
+def judge_calibration(window: "KeyframeWindow") -> None:
     """What is wrong with it, which offset poses stand on, and whether that is larger than calibrations usually have."""
     _correct_calibration(window)
     prior, before = window.calibration, window.held_offset
@@ -56,7 +54,7 @@ def judge_calibration(window: KeyframeWindow) -> None:
         _move_baseline(window, held - float(window.expected[0]))
 
 
-def _correct_calibration(window: KeyframeWindow) -> None:
+def _correct_calibration(window: "KeyframeWindow") -> None:
     """Moves considered errors to what images show of all of them together, and widens those that causes move.
 
     One error alone would stand for others, too. The disparity offset is estimated anyway; it is expected where a yaw
@@ -76,7 +74,7 @@ def _correct_calibration(window: KeyframeWindow) -> None:
     _set_errors(window, np.flatnonzero(moves), means[moves], spreads[moves])
 
 
-def _move_baseline(window: KeyframeWindow, offset: float) -> None:
+def _move_baseline(window: "KeyframeWindow", offset: float) -> None:
     """Takes the baseline for one that made up for an offset when the rig was calibrated, as uncertain as that."""
     if window.board_disparity is None:
         seen = float(np.median(window.landmarks.estimate[:, 2]))
@@ -85,7 +83,7 @@ def _move_baseline(window: KeyframeWindow, offset: float) -> None:
     _set_errors(window, _BASELINE, change, change)
 
 
-def _set_errors(window: KeyframeWindow, index: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> None:
+def _set_errors(window: "KeyframeWindow", index: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> None:
     """Gives considered errors other means (K,), and standard deviations (K,) more beside their usual ones."""
     variance = window.calibration.covariance.copy()
     variance[index, index] += spread**2 - window.corrected[1, index] ** 2

@@ -103,7 +103,6 @@ class CalibrationPrior:
         """Of a rectified pair.
 
         Args:
-            camera: the pair.
             sigmas: of its calibration; none counts as smaller than a share of the usual one, 0.07.
             offset_sigma: of the disparity offset, which is estimated, pixels.
             estimate: names of other errors to estimate.

@@ -16,7 +16,6 @@ class EstimatorGraphs:
     """The steps that a frame's update and a window's solution are made of.
 
     Args:
-        camera: the rectified pair.
         backend: "onnx", of which what is compiled takes the place; or "torch".
         unscented: linearise by sigma points; else by first derivatives.
 

@@ -62,7 +62,10 @@ class Alignment:
 
 
 def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
-    """Whether the gyro's turns between poses (N, 4, 4) of the sensor are theirs: unit, axes and clock are right."""
+    """Whether the gyro's turns between poses (N, 4, 4) of the sensor are those of the images.
+
+    So that its unit, axes and clock are right; the N - 1 motions were integrated with its bias.
+    """
     R = bodies[:, :3, :3]
     seen = rotation_log(R[:-1].transpose(0, 2, 1) @ R[1:])
     measured = rotation_log(np.array([each.turn for each in motions]))
@@ -71,7 +74,11 @@ def gyro_fits(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
 
 
 def align_gyro(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gyro bias (3,) on top of that of motions between poses (N, 4, 4), covariance, slope (3, 19) by the sensor."""
+    """The gyro's bias by the turns between poses (N, 4, 4) of the sensor that images saw, least squares.
+
+    Bias (3,) on top of the one that the N - 1 motions were integrated with, rad/s, its covariance (3, 3), and its slope
+    (3, 19) by errors of the sensor.
+    """
     R = bodies[:, :3, :3]
     turns = np.array([each.turn for each in motions])
     slope, by = (np.concatenate([each.slope[TURN, part] for each in motions]) for part in (GYRO_BIAS, SENSOR))

@@ -42,9 +42,7 @@ class KeyframeWindow:
     """Poses of the last keyframes, the stereo calibration, and the landmarks that connect them; owns the state.
 
     Args:
-        camera: the rectified pair.
         calibration: prior of its errors.
-        graphs: the equations.
         student_freedom: degrees of freedom of the errors' Student-t; infinite: Gaussian.
         usual: prior of a calibration with which nothing is wrong; `calibration` by default.
 

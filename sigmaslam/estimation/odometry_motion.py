@@ -116,7 +116,10 @@ class OdometryMotion(MotionFilter):
     # ---- parts
 
     def _mean_twist(self, start: float, end: float) -> tuple[np.ndarray | None, np.ndarray]:
-        """Twist (6,) of the vehicle, None without samples, and spectra (6,) of what it may have done between them."""
+        """Twist (6,) of the vehicle that leads from one of its poses to another; None without samples.
+
+        And spectra (6,) of what it may have done between samples, and beyond them, where its velocity is held.
+        """
         table = self.samples.around(start, end)
         if not len(table):
             return None, np.zeros(6)

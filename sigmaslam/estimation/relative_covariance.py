@@ -73,8 +73,9 @@ def relative_to_first(poses: PastPoses, indices: list[int]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class _Earlier:
-    """Poses (M, 4, 4) of keyframes, covariances, own (M, 6, 6) and with the window's state (M, 6, n), and factors of
-    the errors of the calibration in common (M, 6, 15).
+    """Poses (M, 4, 4) of keyframes: their `own` covariances (M, 6, 6), and those with the window's state (M, 6, n).
+
+    `common` (M, 6, 15) is how considered errors of the calibration enter their errors.
     """
 
     poses: np.ndarray

@@ -1,7 +1,5 @@
 """The equations of a window of keyframes, as its graphs take them."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def eliminate_landmarks(
-    window: KeyframeWindow, observations: KeyframeViews
+    window: "KeyframeWindow", observations: KeyframeViews
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
     """Information matrix and vector of the state at the posterior, every landmark's own equations solved for it.
 
@@ -32,7 +30,7 @@ def eliminate_landmarks(
     return information, vector, rows, eliminated
 
 
-def gate_views(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarray:
+def gate_views(window: "KeyframeWindow", observations: KeyframeViews) -> np.ndarray:
     """(O,) bool: which views fit the posterior (99.9 %)."""
     rows, owner = np.unique(observations.views.landmark, return_inverse=True)
     if not len(rows):
@@ -41,9 +39,12 @@ def gate_views(window: KeyframeWindow, observations: KeyframeViews) -> np.ndarra
 
 
 def _views(
-    window: KeyframeWindow, observations: KeyframeViews, rows: np.ndarray, owner: np.ndarray
+    window: "KeyframeWindow", observations: KeyframeViews, rows: np.ndarray, owner: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`, whose landmark (K,) is `owner` (O,)."""
+    """The fields of `sigmaslam_models.estimator.window_solution.WindowViews`.
+
+    View o of O sees the landmark in row `rows[owner[o]]` (K,) of the landmark table.
+    """
     state, landmarks, views = window.posterior, window.landmarks, observations.views
     anchor = landmarks.anchor[views.landmark]
     pairs, pair = np.unique(anchor * len(state) + observations.keyframe, return_inverse=True)

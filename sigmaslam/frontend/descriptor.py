@@ -215,8 +215,10 @@ class DescriptorFrontend:
 
 @dataclass(frozen=True, slots=True)
 class _FollowedPatches(Table):
-    """M keypoints of keyframes in an image, before they are verified: `key_index` of the keyframe of `search`, places
-    (M, 2) expected and found, with sigmas of the former, pixels.
+    """M keypoints of keyframes in an image, before they are verified.
+
+    Each is number `key_index` of the features of the keyframe of `search`; it was expected at `predicted` (M, 2) with
+    `expected_disparity`, and found at `places` (M, 2), all in pixels as is its `sigma0`.
     """
 
     search: np.ndarray

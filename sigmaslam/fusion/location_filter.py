@@ -87,7 +87,6 @@ class LocationFilter:
         estimate = location.fuse(tracker.step(left, right, timestamp))
 
     Args:
-        readings: of the sensor.
         on_object: the sensor is on the body that a camera at rest follows.
     """
 

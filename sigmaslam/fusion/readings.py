@@ -37,7 +37,6 @@ class Locations:
         rotations: (N, 3, 3) of the sensor's axes in its world; None from a sensor of positions.
         covariances: (N, m, m) metres and radians squared: position along the axes of the sensor's world, m = 3; with
             rotations m = 6, the rotation about the axes of the sensor.
-        source: the file.
     """
 
     timestamps: np.ndarray

@@ -222,7 +222,6 @@ def reading_jacobian(
     """Derivative (..., m, 18) of the expected readings by drift, A and B, by central differences.
 
     Args:
-        model: of the sensor.
         poses: (..., 4, 4) of the tracker.
         positions, rotations: (..., 3), (..., 3, 3) or None of the readings.
     """

@@ -388,6 +388,11 @@ class RectifiedStereo:
         """fx times the baseline: disparity times depth, pixels metres."""
         return self.fx * self.baseline
 
+    @staticmethod
+    def right_pixels(uvd: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) of the right image that show what the left one has at (u, v, disparity) (..., 3)."""
+        return np.stack([uvd[..., 0] - uvd[..., 2], uvd[..., 1]], axis=-1)
+
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Rays (..., 3) of unit depth in the left camera frame through pixels (..., 2)."""
         u, v = pixels[..., 0], pixels[..., 1]

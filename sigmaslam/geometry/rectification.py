@@ -25,7 +25,6 @@ class StereoRectifier:
     `CameraModel.project`, as OpenCV's ignore skew and have no pair of different lens models.
 
     Attributes:
-        camera: the calibration.
         rectified: the geometry of the output pair.
         R_rectified_left, R_rectified_right: (3, 3) rotations from the original to the rectified eye.
         valid_mask: (H, W) uint8, 255 where the left rectified pixel comes from inside the left image, at

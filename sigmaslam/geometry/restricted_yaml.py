@@ -22,9 +22,7 @@ def parse_yaml(text: str, path: Path, error: type[InputError] = InputError) -> A
     """Content of a YAML document: mappings, lists, text, numbers, truth values and None; dates stay text.
 
     Args:
-        text: of the document.
         path: of its file, for messages.
-        error: to raise.
     Raises:
         InputError: the text is no YAML, has a key twice, or goes beyond a limit; names file, line or key, and the mend.
     """

@@ -22,7 +22,6 @@ def network_path(name: str, weights: WeightsFolder = None, backend: str = "onnx"
 
     Args:
         name: one of `NETWORKS`.
-        weights: folder.
         backend: "onnx" or "torch".
     Raises:
         InputError: the folder has the network, but not in the form that this back-end reads.

@@ -17,9 +17,6 @@ _MEND = "reinstall the package, or export the graphs again with `sigmaslam train
 def check_weights(path: Path, content: bytes) -> None:
     """Compares a file of weights with the manifest beside it; without a manifest, or if it is not in it, it may pass.
 
-    Args:
-        path: of the file.
-        content: of the file.
     Raises:
         InputError: the file is not the one that was exported, or the manifest cannot be read.
     """

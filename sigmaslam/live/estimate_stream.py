@@ -1,7 +1,5 @@
 """Estimates as lines of JSON while a run goes on: to the standard output, or as UDP datagrams."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -66,7 +64,7 @@ def format_estimate(frame: TrackedFrame) -> bytes:
     return json.dumps(describe_estimate(frame), allow_nan=False).encode("ascii") + b"\n"
 
 
-def open_stream(target: str) -> PipeStream | UdpStream:
+def open_stream(target: str) -> "PipeStream | UdpStream":
     """The stream that the command line names.
 
     Args:

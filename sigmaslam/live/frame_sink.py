@@ -26,7 +26,6 @@ class TrackedFrame:
 
     Attributes:
         number: of its row in frames.csv, from 0 on.
-        result: of the tracker.
         seen: the images with their matches; None where a caller has none.
         colour: of the frame, as `StereoFrame` has it.
     """
@@ -121,7 +120,6 @@ def check_sink_path(option: str, path: Path, out: Path, name: str) -> None:
 
     Args:
         option: of the command line, for messages.
-        path: of the file.
         out: folder of the run, which may be still to make.
         name: that the file has in the folder of a run, where `--overwrite` removes it; elsewhere its suffix counts.
     Raises:

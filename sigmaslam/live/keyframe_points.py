@@ -18,7 +18,6 @@ class KeyframePoints:
         camera: of the raw images.
 
     Attributes:
-        camera: the rectified pair.
         T_left_rectified: (4, 4) takes points of the rectified left camera into the left one.
     """
 

@@ -71,7 +71,6 @@ class BagReader:
     """An open bag.
 
     Attributes:
-        path: the bag.
         topics: (message type, number of messages) by topic; topics without messages are left out.
     """
 

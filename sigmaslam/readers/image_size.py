@@ -13,11 +13,7 @@ _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9}
 
 
 def image_size(content: bytes) -> tuple[int, int] | None:
-    """(width, height) in pixels of a PNG, JPEG, BMP, TIFF or PNM file; None for other files and broken headers.
-
-    Args:
-        content: of the file.
-    """
+    """(width, height) in pixels of a PNG, JPEG, BMP, TIFF or PNM file; None for other files and broken headers."""
     try:
         if content.startswith(b"\x89PNG\r\n\x1a\n"):
             return _png_size(content)

@@ -26,7 +26,6 @@ def open_imu(sequence: StereoSequence, given: str | None) -> InertialRecording |
     """The inertial sensor beside the images.
 
     Args:
-        sequence: of the images.
         given: a table, a folder of EuRoC's or KITTI raw's, a topic of the bag, or "off"; None: the one that the
             recording has, if files say all of it.
     Raises:

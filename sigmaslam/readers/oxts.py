@@ -83,7 +83,6 @@ def find_kitti_mounting(path: Path, is_rectified: bool, camera: int) -> np.ndarr
     """T_left_imu (4, 4) by KITTI raw's three calibrations; None where they are not above the packets.
 
     Args:
-        path: the packets.
         is_rectified: the images are.
         camera: KITTI's number of the left one.
     Raises:

@@ -62,7 +62,6 @@ def read_covariances(path: Path, count: int) -> np.ndarray:
     """The covariances of a covariance.npy, checked against the number of poses in the trajectory beside it.
 
     Args:
-        path: of the file.
         count: poses of trajectory.tum.
     Returns:
         (count, 6, 6) float64.

@@ -110,7 +110,6 @@ class DepthPixels(Table):
         """Points in the world.
 
         Args:
-            camera: the rectified pair.
             pose, pose_covariance: (4, 4) T_world_rectified and its covariance (6, 6) in the rectified camera's frame,
                 translation (metres) before rotation (radians).
         """
@@ -190,7 +189,7 @@ class VoxelCloud:
         keys, levels, sums = keys[order], levels[order], sums[order]
         information, count = sums[:, :6], sums[:, 12]
         covariance = inverse(information)
-        points = _times(covariance, sums[:, 6:9])
+        points = _product(covariance, sums[:, 6:9])
         finest = np.ones(len(keys), bool)
         for level in range(1, int(levels.max(initial=0)) + 1):
             here = levels == level
@@ -223,7 +222,7 @@ class Voxels:
     def add(self, points: np.ndarray, covariances: np.ndarray, sigma: np.ndarray, *seen: np.ndarray) -> None:
         """Takes points (N, 3), covariances (N, 6), sigmas without the pose's, colours (N, 3), views (N,)."""
         information, (colours, views) = inverse(covariances.astype(np.float64)), seen
-        sums = np.column_stack([information, _times(information, points), colours * views[:, None], views])
+        sums = np.column_stack([information, _product(information, points), colours * views[:, None], views])
         cells = _voxels(points, sigma, self._size)
         self.merge(cells @ _ONE_KEY, cells[:, 3].astype(np.uint8), sums)
 
@@ -266,7 +265,7 @@ def write_cloud(path: Path, cloud: DenseCloud) -> None:
     write_ply(path, columns)
 
 
-def _times(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def _product(six: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Products (N, 3) of symmetric matrices of such numbers (N, 6) and vectors (N, 3)."""
     xx, xy, xz, yy, yz, zz = six.T
     x, y, z = vectors.T

@@ -132,7 +132,6 @@ def fuse_depth(
         reference: its disparities.
         others: of each other keyframe its view, T_other_reference (4, 4), and the covariance (6, 6) of that,
             perturbed from the left: translation (metres) before rotation (radians).
-        camera: the rectified pair.
         shared: of the variances this share is common to all of them.
     """
     shape = reference.disparity.shape
@@ -162,11 +161,11 @@ def fuse_depth(
     scale = (_FREEDOM + cost) / (_FREEDOM + support)
     fused = scale * variance + np.maximum(scale, np.float32(1.0)) * common
     return FusedDepth(
-        _spread(mean, known, shape, np.nan),
-        _spread(fused, known, shape, np.nan),
-        _spread(support, known, shape, 0),
-        _spread(contradictions, known, shape, 0),
-        _spread(is_seen_again, known, shape, False),
+        _as_image(mean, known, shape, np.nan),
+        _as_image(fused, known, shape, np.nan),
+        _as_image(support, known, shape, 0),
+        _as_image(contradictions, known, shape, 0),
+        _as_image(is_seen_again, known, shape, False),
     )
 
 
@@ -318,7 +317,7 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.asarray(((1 - low) * upper + low * lower).T)
 
 
-def _spread(values: np.ndarray, known: np.ndarray, shape: tuple[int, ...], missing: float) -> np.ndarray:
+def _as_image(values: np.ndarray, known: np.ndarray, shape: tuple[int, ...], missing: float) -> np.ndarray:
     """Values of the known pixels as an image."""
     image = np.full(shape, missing, values.dtype)
     image.ravel()[known] = values

@@ -11,6 +11,7 @@ from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_inverse
 from sigmaslam.reconstruction.cloud import DenseCloud, write_cloud
+from sigmaslam.table import even_rows
 
 # Points of the COLMAP model, an even selection: so many start a splat.
 _MOST_POINTS = 200_000
@@ -61,7 +62,7 @@ class PosedImages:
         # Two lines an image; the second one, of keypoints, is empty.
         images = [f"{k + 1} {_inverse_pose(pose)} 1 {_name(k)}\n\n" for k, pose in enumerate(self._poses)]
         atomic_write_text(model / "images.txt", "".join(images))
-        rows = np.unique(np.linspace(0, max(len(cloud) - 1, 0), min(len(cloud), _MOST_POINTS)).astype(np.int64))
+        rows = even_rows(len(cloud), _MOST_POINTS)
         lines = [
             f"{k + 1} {x:.5f} {y:.5f} {z:.5f} {red:.0f} {green:.0f} {blue:.0f} 0\n"
             for k, (x, y, z, red, green, blue) in enumerate(np.hstack([cloud.points[rows], cloud.colours[rows]]))

@@ -39,7 +39,6 @@ class RecordedKeyframes:
 
     Attributes:
         source, format: of the run's input.
-        camera: its calibration.
         is_keyframe: (K,) bool.
         timestamps: (K,) seconds.
         poses: (K, 4, 4) T_world_camera of the left camera, after the fact where the run has that.
@@ -184,7 +183,6 @@ def open_input(keyframes: RecordedKeyframes, moved_to: Path | None = None) -> St
     """The run's input, with images of the size of the run's calibration.
 
     Args:
-        keyframes: of the run.
         moved_to: where the input is now, if not where the run found it.
     Raises:
         InputError: it is not there, or is another one.

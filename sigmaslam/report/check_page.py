@@ -11,6 +11,7 @@ from sigmaslam.files import atomic_write_text
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.report.page_parts import data_url, load_template, read_asset
 from sigmaslam.run_record.frame_pictures import small_jpeg
+from sigmaslam.table import even_rows
 
 # Thumbnails, pixels, and how many.
 _WIDTH, _MOST = 640, 4
@@ -24,6 +25,7 @@ def write_page(path: Path, check: Check, source: str) -> None:
     Raises:
         InputError: the folder is missing or cannot be written.
     """
+    shown = even_rows(len(check.steps), _MOST).tolist()
     kind, word = verdict(check.findings)
     text = load_template("check.html").render(
         styles=read_asset("report.css"),
@@ -32,16 +34,10 @@ def write_page(path: Path, check: Check, source: str) -> None:
         word=word,
         faults=wrong(check.findings),
         findings=check.findings,
-        pictures=[(f"pair {index}", _picture(check, k)) for k, index in _shown(check)],
+        pictures=[(f"pair {check.steps[k][0].index}", _picture(check, k)) for k in shown],
         tolerance=ROW_TOLERANCE,
     )
     atomic_write_text(path, text)
-
-
-def _shown(check: Check) -> list[tuple[int, int]]:
-    """Number among the samples and index in the sequence of the pairs that are drawn."""
-    chosen = np.unique(np.linspace(0, len(check.steps) - 1, min(_MOST, len(check.steps))).astype(int)).tolist()
-    return [(k, check.steps[k][0].index) for k in chosen]
 
 
 def _picture(check: Check, number: int) -> str:

@@ -1,7 +1,5 @@
 """Pictures of figures, in files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +9,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def save_png(figure: Figure, path: str | Path) -> None:
+def save_png(figure: "Figure", path: str | Path) -> None:
     """Write the figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130)

@@ -26,9 +26,9 @@ from sigmaslam.report.report_scene import build_scene
 from sigmaslam.run_record.frame_pictures import FramePictures
 from sigmaslam.run_record.frame_table import STATUSES, FrameTable
 from sigmaslam.run_record.recorded_run import RecordedRun, read_run
+from sigmaslam.run_record.run_folder import REPORT_NAME
 from sigmaslam.run_record.verdict import contradiction_verdict
 
-REPORT_NAME = "report.html"
 MAX_CONFIGURATION = 20_000
 """The report shows at most so many characters of run.json."""
 PICTURE_MAGNIFICATION = 4

@@ -8,6 +8,7 @@ from sigmaslam.geometry.se3 import transform_points
 from sigmaslam.live.frame_drawing import extent, format_length
 from sigmaslam.run_record.frame_table import STATUSES
 from sigmaslam.run_record.recorded_run import RecordedRun
+from sigmaslam.table import even_rows
 
 MAX_POSES, MAX_POINTS, MAX_ELLIPSOIDS, MAX_KEYFRAMES = 20_000, 40_000, 40, 400
 """With more of them an even selection is shown."""
@@ -23,17 +24,16 @@ def build_scene(run: RecordedRun, most: int = MAX_POSES, start: float | None = N
     Of a run that follows a body the path is the body's, and its points are where it was last.
 
     Args:
-        run: the run.
         most: poses of its path.
         start: time stamp of 0 s; by default that of the first frame.
     """
     if not len(run.trajectory):
         return None
     positions = run.trajectory.positions
-    shown = _even(len(positions), most)
+    shown = even_rows(len(positions), most)
     # A short loss stays visible in a selection.
     lost = np.flatnonzero(np.array(run.pose_status) == "lost")
-    shown = np.union1d(shown, lost[_even(len(lost), most)])
+    shown = np.union1d(shown, lost[even_rows(len(lost), most)])
     seconds = run.trajectory.timestamps - (run.frames.columns["timestamp"][0] if start is None else start)
     status = np.array([STATUSES.index(each) for each in run.pose_status], np.uint8)
     # Corners of what the view shows.
@@ -64,12 +64,7 @@ def build_scene(run: RecordedRun, most: int = MAX_POSES, start: float | None = N
     }
     if run.evaluated is not None:
         others["truth"] = run.evaluated.truth
-    return scene | {name: line[_even(len(line), most)] for name, line in others.items()}
-
-
-def _even(count: int, most: int) -> np.ndarray:
-    """Indices of an even selection, the last one included."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64)) if count else np.zeros(0, np.int64)
+    return scene | {name: line[even_rows(len(line), most)] for name, line in others.items()}
 
 
 def _placed_points(run: RecordedRun) -> np.ndarray:
@@ -82,8 +77,8 @@ def _points(run: RecordedRun) -> dict[str, Any]:
     """Map points, their sigmas, and their grey values where they are known."""
     if run.map is None:
         return {"points": np.zeros((0, 3)), "point_sigma": np.zeros(0), "point_grey": None}
-    shown = _even(len(run.map.points), MAX_POINTS)
-    grey = run.map.colours[shown]
+    shown = even_rows(len(run.map.points), MAX_POINTS)
+    grey = run.map.colours[shown, 0]
     known = np.isfinite(grey).all()
     return {
         "points": _placed_points(run)[shown],
@@ -103,13 +98,13 @@ def _keyframes(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
     same = np.abs(run.trajectory.timestamps[began] - of_poses["loop"][closing]) < 1e-3
     positions = run.trajectory.positions
     loops = np.stack([positions[closing[same]], positions[began[same]]], axis=1)
-    return run.trajectory.poses[rows[_even(len(rows), MAX_KEYFRAMES)]], loops
+    return run.trajectory.poses[rows[even_rows(len(rows), MAX_KEYFRAMES)]], loops
 
 
 def _ellipsoids(run: RecordedRun) -> tuple[np.ndarray, np.ndarray]:
     """Transforms (E, 4, 4) of the unit sphere into 1-sigma ellipsoids of positions, and the poses (E,) they are of."""
     known = np.flatnonzero(np.isfinite(run.covariances).all(axis=(1, 2)))
-    rows = known[_even(len(known), MAX_ELLIPSOIDS)]
+    rows = known[even_rows(len(known), MAX_ELLIPSOIDS)]
     variances, axes = np.linalg.eigh(run.covariances[rows, :3, :3])
     transforms = run.trajectory.poses[rows].copy()
     half_axes = axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]

@@ -7,6 +7,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import load_columns
 from sigmaslam.files import save_arrays
+from sigmaslam.table import even_rows
 
 DENSE_NAME, RECONSTRUCTION_NAME, CLOUD_NAME = "dense.npz", "reconstruction.json", "cloud.ply"
 MAX_POINTS = 150_000
@@ -21,7 +22,8 @@ class RecordedPoints:
     Attributes:
         points: (N, 3) in the world, metres.
         sigma: (N,) root of the largest eigenvalue of the covariance, metres; NaN where it is not known.
-        colours: (N,) grey values in the images, or (N, 3) red, green and blue, 0 to 255; NaN where they are not known.
+        colours: (N, 3) red, green and blue in the images, 0 to 255, all three the grey value of a map; NaN where they
+            are not known.
     """
 
     points: np.ndarray
@@ -33,10 +35,9 @@ def write_dense_points(path: Path, points: np.ndarray, sigma: np.ndarray, colour
     """Writes an even selection of points.
 
     Args:
-        path: of the file.
         points, sigma, colours: (N, 3), (N,) and (N, 3) as of `RecordedPoints`; float32 and uint8 are kept.
     """
-    rows = np.unique(np.linspace(0, max(len(points) - 1, 0), min(len(points), MAX_POINTS)).astype(np.int64))
+    rows = even_rows(len(points), MAX_POINTS)
     shades = np.clip(np.rint(colours[rows]), 0, 255).astype(np.uint8)
     metres, sigmas = points[rows].astype(np.float32), sigma[rows].astype(np.float32)
     save_arrays(path, points=metres, sigma=sigmas, colours=shades)

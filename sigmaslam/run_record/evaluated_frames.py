@@ -44,7 +44,6 @@ def read_evaluated_frames(path: Path, count: int) -> EvaluatedFrames:
     """The content of an evaluation.npz.
 
     Args:
-        path: of the file.
         count: poses of trajectory.tum beside it.
     Raises:
         InputError: it is no such file, or of another run.

@@ -67,7 +67,6 @@ def predicted_poses(frames: FrameTable, timestamps: np.ndarray) -> np.ndarray:
     """(N,) bool, which poses the motion alone predicts: of frames that are lost or skipped, or start without success.
 
     Args:
-        frames: of the run.
         timestamps: (N,) of its poses, seconds.
     """
     status = np.array(frames.status)

@@ -66,8 +66,6 @@ def write_pose_table(path: Path, records: PoseRecords, frames: FrameTable) -> No
     """Writes poses as they were said, with the status of their frames.
 
     Args:
-        path: of the table.
-        records: the poses.
         frames: of the run, in order of time.
     """
     # frames.csv has nanoseconds.

@@ -22,10 +22,9 @@ from sigmaslam.run_record.frame_pictures import PICTURES_NAME, FramePictures, re
 from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, read_frames
 from sigmaslam.run_record.inertial_file import InertialRecords, read_inertial_records
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, read_frame_pairs
-from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, RUN_NAME
+from sigmaslam.run_record.run_folder import FINAL_TRAJECTORY, MAP_NAME, RUN_NAME
 
 REFINED_TRAJECTORY, REFINE_NAME = "trajectory_refined.tum", "refine.json"
-_MAP_NAME = "map.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,6 @@ class RecordedRun:
         covariances: (N, 6, 6) in their own frames, translation (metres) before rotation (radians); NaN without them.
         pose_row: (N,) row in `frames` of each pose.
         final, refined: trajectories after the fact and after `sigmaslam map refine`.
-        map: the points.
         dense: points of `sigmaslam map reconstruct`.
         pictures: of some frames.
         entries: of run.json.
@@ -120,7 +118,7 @@ def read_run(folder: Path) -> RecordedRun:
         pose_row=pose_row,
         final=_read_trajectory(folder / FINAL_TRAJECTORY),
         refined=_read_trajectory(folder / REFINED_TRAJECTORY),
-        map=_read_map(folder / _MAP_NAME),
+        map=_read_map(folder / MAP_NAME),
         dense=read_dense_points(folder / DENSE_NAME) if (folder / DENSE_NAME).is_file() else None,
         pictures=read_pictures(folder / PICTURES_NAME) if (folder / PICTURES_NAME).is_file() else None,
         entries=_read_json(folder / RUN_NAME, "track"),
@@ -177,7 +175,8 @@ def _read_map(path: Path) -> RecordedPoints | None:
     largest = np.full(len(points), np.nan)
     if known.any():
         largest[known] = np.linalg.eigvalsh(covariances[known])[:, -1]
-    return RecordedPoints(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], arrays["intensity"][kept])
+    colours = np.repeat(arrays["intensity"][kept, None], 3, axis=1)
+    return RecordedPoints(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], colours)
 
 
 def _read_json(path: Path, command: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_bytes, save_arrays
+from sigmaslam.files import atomic_write_bytes
 from sigmaslam.run_record.appended_file import AppendedFile, pack_rows, read_rows
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
 from sigmaslam.table import Table
@@ -74,16 +74,10 @@ def write_partial_frame_pairs(folder: Path, pairs: FramePairs, timestamps: np.nd
     atomic_write_bytes(folder / PARTIAL_RELATIVE_POSES, content)
 
 
-def write_frame_pairs(path: Path, pairs: FramePairs) -> None:
-    """Writes the columns as arrays by name."""
-    save_arrays(path, **pairs.arrays())
-
-
 def read_frame_pairs(path: Path, count: int) -> FramePairs:
     """The content of a relative_poses.npz.
 
     Args:
-        path: of the file.
         count: poses of trajectory.tum beside it.
     Raises:
         InputError: it is no such file, or of another run.

@@ -33,7 +33,7 @@ from sigmaslam.slam.point_map import PointMap
 
 FINAL_TRAJECTORY, FINAL_COVARIANCE = "trajectory_final.tum", "covariance_final.npy"
 RUN_NAME = "run.json"
-VIDEO_NAME, RERUN_NAME = "video.mp4", "rerun.rrd"
+MAP_NAME, REPORT_NAME, VIDEO_NAME, RERUN_NAME = "map.npz", "report.html", "video.mp4", "rerun.rrd"
 """Of what may stand in the folder beside the results."""
 UNFINISHED = "not yet"
 """What run.json has under `ended` while a run goes on, and after it was killed."""
@@ -92,7 +92,6 @@ class RunWriter:
         """Takes the result of one frame; it is on disk when this returns.
 
         Args:
-            estimate: of the camera.
             pose, covariance: (4, 4), (6, 6) of what is tracked: the camera in the world, or a body in the camera.
             matching: (6, 6) the part of the covariance that comes from matches and motion.
             read_ms: time it took to read the images.

@@ -23,7 +23,6 @@ def calibrate_imu_by_run(
 
     Args:
         folder: of the run.
-        recording: the sensor.
         done: as of `calibrate_imu`.
     Returns:
         The calibration, and the run's camera.

@@ -59,10 +59,11 @@ class StereoFilter:
         Raises:
             FrameError: the images are too small to filter.
         """
-        left, right = (
-            to_bytes(_filter_next(eye, image, f"frame {frame.index}"))
-            for eye, image in zip(self._eyes, (frame.left, frame.right), strict=True)
-        )
+        images, name = (frame.left, frame.right), f"frame {frame.index}"
+        for image in images:
+            _check_size(image, name)
+        with _naming([name]):
+            left, right = (to_bytes(eye.step(image)) for eye, image in zip(self._eyes, images, strict=True))
         return replace(frame, left=left, right=right)
 
     def describe(self) -> list[dict[str, Any]]:
@@ -115,7 +116,6 @@ _Results = Iterator[tuple[str, NoiseModel | None, np.ndarray]]
 def _filter_alone(source: Path, noise: NoiseModel | None, thorough: bool, blur: float) -> _Results:
     """Names, noise and estimates."""
     for name, image in _read(source):
-        _check_size(image, name)
         own = replace(noise or estimate_noise(image), blur=blur)
         yield name, own, denoise_image(image, own, thorough)
 
@@ -126,7 +126,6 @@ def _filter_sequence(source: Path, noise: NoiseModel | None) -> _Results:
 
     def images() -> Iterator[np.ndarray]:
         for name, image in _read(source):
-            _check_size(image, name)
             names.append(name)
             yield image
 
@@ -136,25 +135,19 @@ def _filter_sequence(source: Path, noise: NoiseModel | None) -> _Results:
 
 
 def _read(source: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and grey images."""
-    if source.is_dir():
-        for path in list_images(source):
-            yield path.name, read_grey(path)
-    elif _is_image(source):
-        yield source.name, read_grey(source)
+    """Names and grey images, large enough to filter."""
+    if source.is_dir() or _is_image(source):
+        paths = list_images(source) if source.is_dir() else [source]
+        images = ((path.name, read_grey(path)) for path in paths)
     else:
-        for index, image in enumerate(read_frames(source)):
-            yield f"{index:06d}.png", image
+        images = ((f"{index:06d}.png", image) for index, image in enumerate(read_frames(source)))
+    for name, image in images:
+        _check_size(image, name)
+        yield name, image
 
 
 def _is_image(source: Path) -> bool:
     return source.is_file() and source.suffix.lower() in IMAGE_SUFFIXES
-
-
-def _filter_next(follow: SequenceFilter, image: np.ndarray, name: str) -> np.ndarray:
-    _check_size(image, name)
-    with _naming([name]):
-        return follow.step(image)
 
 
 @contextmanager

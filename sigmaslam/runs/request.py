@@ -1,7 +1,5 @@
 """What `sigmaslam track` is asked for, in parts; fields have the names of the command's options."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -85,7 +83,7 @@ class InputOptions:
     mask: Path | None = None
     imu: str | None = None
     odometry: Path | None = None
-    findings: Sequence[Finding] = ()
+    findings: "Sequence[Finding]" = ()
 
     def __post_init__(self) -> None:
         _check(_given(self))
@@ -155,12 +153,12 @@ class TrackerOptions:
     frontend: str = "learned"
     backend: str = "onnx"
     provider: str = "cpu"
-    weights: WeightsFolder = None
-    config: TrackerConfig | None = None
+    weights: "WeightsFolder" = None
+    config: "TrackerConfig | None" = None
     threads: int = 2
     map: Path | None = None
     track_object: str | None = None
-    location: Locations | None = None
+    location: "Locations | None" = None
     realtime: bool = False
     denoise: bool = False
 
@@ -180,8 +178,8 @@ class LiveOptions:
     viewer: str | None = None
     serve: str | None = None
     dense: Path | None = None
-    on_estimate: Callable[[Estimate | ObjectEstimate], None] | None = None
-    sinks: Sequence[FrameSink] = ()
+    on_estimate: "Callable[[Estimate | ObjectEstimate], None] | None" = None
+    sinks: "Sequence[FrameSink]" = ()
 
 
 @dataclass(frozen=True, slots=True)

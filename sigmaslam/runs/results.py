@@ -26,19 +26,19 @@ from sigmaslam.run_record.frame_table import (
 )
 from sigmaslam.run_record.inertial_file import describe_gravity, read_inertial_records
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, POSES_NAME, PoseRecords, read_pose_records, write_pose_table
-from sigmaslam.run_record.relative_pose_file import (
-    PARTIAL_RELATIVE_POSES,
-    RELATIVE_POSES_NAME,
-    collect_frame_pairs,
-    write_frame_pairs,
+from sigmaslam.run_record.relative_pose_file import PARTIAL_RELATIVE_POSES, RELATIVE_POSES_NAME, collect_frame_pairs
+from sigmaslam.run_record.run_folder import (
+    FINAL_COVARIANCE,
+    FINAL_TRAJECTORY,
+    MAP_NAME,
+    REPORT_NAME,
+    RUN_NAME,
+    write_map_points,
 )
-from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, RUN_NAME, write_map_points
 from sigmaslam.run_record.verdict import calibration_verdict, expected_offset, explain_failure
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
 
-MAP_NAME = "map.npz"
-REPORT_NAME = "report.html"
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -47,7 +47,6 @@ class TrackerResults:
     """What the tracker alone knows when a run ends; each is computed when it is written.
 
     Attributes:
-        point_map: the landmarks.
         keyframes: arrays by name, with which a later run relocalises in the map.
         final: the frames as they are known in the end, with covariances; they are written beside those said at once.
             None where other sensors corrected the poses, whose covariances then have no part of matches alone.
@@ -177,7 +176,8 @@ def _write_poses(files: _Files, records: PoseRecords, frames: FrameTable, has_ma
     if has_matching:
         files.attempt("covariance_matching.npy", lambda path: save_array(path, records.matching))
     files.attempt(
-        RELATIVE_POSES_NAME, lambda path: write_frame_pairs(path, collect_frame_pairs(path.parent, records.timestamp))
+        RELATIVE_POSES_NAME,
+        lambda path: save_arrays(path, **collect_frame_pairs(path.parent, records.timestamp).arrays()),
     )
 
 

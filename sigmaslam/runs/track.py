@@ -252,7 +252,10 @@ def _sensors(sequence: StereoSequence, tracker: Tracker) -> list[_Samples]:
 
 
 class _Rows:
-    """Rows of frames.csv, those before a stop counted, and who is told; of a run that goes on none is written twice."""
+    """Rows of frames.csv, and who is told of them; of a run that goes on none is written twice.
+
+    `count` includes those before a stop; `skipped` are frames that could not be read, so far.
+    """
 
     def __init__(
         self,

@@ -37,7 +37,6 @@ class AppearanceIndex:
         """Numbers of up to `count` keyframes that look most like the view, best first; of equals the newest first.
 
         Args:
-            view: the current one.
             count: at most so many.
             among: numbers of those that are asked for; None: all.
         """

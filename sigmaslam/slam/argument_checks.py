@@ -46,7 +46,6 @@ def check_sample(motion: MotionFilter, name: str, timestamp: float, one: Any, ot
     """A sample of an inertial sensor or of odometry; what takes it.
 
     Args:
-        motion: of the tracker.
         name: "imu" or "odometry".
         timestamp, one, other: the sample.
     Raises:

@@ -1,7 +1,5 @@
 """What the tracker says about one stereo pair."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -98,7 +96,7 @@ class Estimate:
         return bool(np.isfinite(self.T_world_camera).all())
 
     @property
-    def camera(self) -> Estimate:
+    def camera(self) -> "Estimate":
         """The camera's estimate in its world: this one."""
         return self
 
@@ -117,6 +115,6 @@ class Estimate:
         """(6, 6) the part of `pose_covariance` that comes from matches and motion."""
         return self.matching_covariance
 
-    def map_camera(self, change: Callable[[Estimate], Estimate]) -> Estimate:
+    def map_camera(self, change: "Callable[[Estimate], Estimate]") -> "Estimate":
         """The result with another camera estimate."""
         return change(self)

@@ -6,6 +6,7 @@ import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.frontend.lucas_kanade import in_light_of, lucas_kanade
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.frame import Frame
 
 # Frames whose rows are compared together, as in a single one most may move alike, and the fewest landmarks in them:
@@ -38,8 +39,7 @@ class EyeTiming:
         # A power of two, so that most of them are those of the frame before.
         share = 1 << (max(int(stereo.sum()) // _FOLLOWED, 1).bit_length() - 1)
         chosen = np.flatnonzero(stereo & (landmark_id % share == 0))
-        expected = seen[chosen, :2] - np.outer(seen[chosen, 2], (1.0, 0.0))
-        lit = in_light_of(frame.left, frame.right)
+        expected, lit = RectifiedStereo.right_pixels(seen[chosen]), in_light_of(frame.left, frame.right)
         found, ended = lucas_kanade(frame.left, lit, seen[chosen, :2], expected, _WINDOW, 0)
         rows = np.column_stack([seen[:, 1], np.full(len(seen), np.nan)])
         rows[chosen[ended], 1] = found[ended, 1]

@@ -21,7 +21,6 @@ class Frame:
 
     Args:
         left, right: (H, W) uint8, rectified.
-        frontend: detects features.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
         exchanged: gives left and right as they are if each image is the other eye's; by default as they are here.
     """
@@ -71,7 +70,6 @@ def usable_pixels(mask: np.ndarray | None, rectifier: StereoRectifier) -> np.nda
 
     Args:
         mask: (H, W) bool or uint8 of the raw left image, zero where it is not to be used; None: nothing is masked.
-        rectifier: of the camera.
     Raises:
         FrameError: the mask has the wrong type or size, or is zero everywhere.
     """

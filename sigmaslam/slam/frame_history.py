@@ -101,7 +101,6 @@ class FrameHistory:
     """Keeps of every frame how it hangs at its keyframes.
 
     Args:
-        window, keyframes: of the tracker.
         T_rectified_left: (4, 4) takes points of the left camera into the rectified one.
     """
 

@@ -152,7 +152,7 @@ def _rows_in_all(image: _Probed, others: list[_Probed]) -> np.ndarray:
 
 
 def _shows(image: _Probed, other: _Probed, panel: np.ndarray) -> bool:
-    """Whether an eighth of the image in one piece, but for rows of a panel (P,), is as in another one, to the byte."""
+    """Whether an eighth of the image, in rows one below another, is as in another one; rows of a panel do not count."""
     same = [one == another and not fixed for one, another, fixed in zip(image.rows, other.rows, panel, strict=True)]
     for probe, pair in enumerate(pairwise(same)):
         if not all(pair):

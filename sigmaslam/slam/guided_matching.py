@@ -61,12 +61,9 @@ class GuidedMatcher:
     """Active search: finds landmarks within the innovation ellipse of their prediction, keyframe by keyframe.
 
     Attributes:
-        camera: the rectified pair.
-        frontend: matches features.
         window: whose landmarks are searched for.
         update: predicts them.
         noise: of what is matched.
-        config: settings.
     """
 
     camera: RectifiedStereo
@@ -119,7 +116,6 @@ class GuidedMatcher:
         landmarks are searched for in ellipses that much wider.
 
         Args:
-            frame: the current one.
             keyframes, pose, covariance: as of `match_guided`.
             carry: from the left image, ids (K,) and predicted places (K, 2) of landmarks to where optical flow takes
                 them, NaN where it does not.

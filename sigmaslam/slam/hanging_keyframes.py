@@ -24,7 +24,6 @@ def hang_over(
     Args:
         hanging: all of them by their numbers; changed.
         most: at one neighbour; of the two that are closest to each other the later one is forgotten.
-        leaving: the keyframe.
         heir: number of the other one.
         step: (4, 4) T_heir_leaving.
         covariance: (6, 6) of that, perturbed from the left in the heir.

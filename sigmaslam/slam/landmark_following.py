@@ -84,7 +84,6 @@ class LandmarkFollower:
         """Finds the window's landmarks by optical flow from the last frame, aligned to their keyframes' patches.
 
         Args:
-            frame: the current one.
             keyframes: of the window.
             pose, covariance: predicted, as of `GuidedMatcher.match_guided`.
             turn: (3, 3) rotation R_last_current that a sensor has measured; None: unknown.

@@ -65,7 +65,6 @@ class Localiser:
         guided: finds landmarks near a prediction.
         follower: finds them without features.
         unguided: finds keyframes anywhere.
-        config: settings.
         frame_clock: knows the interval of the frames.
     """
 
@@ -86,7 +85,6 @@ class Localiser:
         Nor beside a sensor after half a second: features are found by its prediction, and optical flow strays.
 
         Args:
-            frame: the current one.
             keyframes: of the window.
             prediction: of its pose.
             clock: takes the time of the stages `match` and `filter`.
@@ -122,7 +120,6 @@ class Localiser:
         """Matches and pose of a view, first near the prediction, then anywhere; no pose where too little agrees.
 
         Args:
-            view: the current one.
             keyframes: what the window's keyframes saw.
             prediction: of its pose.
             guided: the velocity is known, so that the prediction says where to search.
@@ -230,7 +227,10 @@ class Localiser:
     def _fit_alone(
         self, matches: GuidedMatches, near: GuidedMatches, prediction: Prediction, start: np.ndarray, scale: float
     ) -> FrameFit | None:
-        """The pose of what was found around `start` (4, 4), by so uncertain a prediction; None if that has a rival."""
+        """The pose of what was found around `start` (4, 4), by a prediction as uncertain as it asks for.
+
+        None where what agrees with the prediction itself explains a rival's part of the image.
+        """
         excess = surprise(self.motion, se3_inverse(self.window.posterior.poses[-1]) @ start)
         pose, covariance, least = prediction.pose, prediction.covariance, self.config.min_inliers
         fit = self.update.fit(matches.views, pose, excess * covariance, least, start, scale)

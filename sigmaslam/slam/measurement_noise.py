@@ -10,11 +10,7 @@ _SCALES, _ADAPTATION = (0.25, 4.0), 0.1
 
 
 class MeasurementNoise:
-    """Covariances of what is measured in images; owns their common scale.
-
-    Args:
-        config: settings.
-    """
+    """Covariances of what is measured in images; owns their common scale."""
 
     def __init__(self, config: TrackerConfig) -> None:
         self._config = config

@@ -18,7 +18,6 @@ class Course:
     """The phase of a tracker, and when it came to it.
 
     Attributes:
-        phase: the current one.
         timestamp: of the last frame, seconds; None before the first.
         waiting_since: time stamp of the first view that could be a keyframe, blurred or not, seconds.
         started_at, tracked_at: time stamps of the first keyframe and of the last pose.

@@ -18,7 +18,6 @@ def retrieve(
     """Up to `count` keyframes that look most like the view, best first; the latest where nothing tells them apart.
 
     Args:
-        view: the current one.
         count: at most so many.
         among: the keyframes, by their numbers upwards.
         appearance: of these, and perhaps of others.

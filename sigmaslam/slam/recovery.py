@@ -34,11 +34,9 @@ class Recovery:
 
     Attributes:
         course: of the tracker; changed.
-        window, keyframes: of the tracker.
         motion: forgets its velocity.
         mapper: inserts keyframes.
         admission: what may become a landmark.
-        config: settings.
         start: pose (4, 4) and covariance (6, 6) of the first keyframe in the world of an earlier run, perturbed
             from the left there; None: its camera is the world.
     """

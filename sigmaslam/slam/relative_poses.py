@@ -56,7 +56,6 @@ class RelativePoseReporter:
 
     Args:
         T_rectified_left: (4, 4) takes points of the left camera into the rectified one.
-        window, keyframes, motion: of the tracker.
     """
 
     def __init__(

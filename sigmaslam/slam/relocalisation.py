@@ -60,7 +60,6 @@ class Relocaliser:
         """Finds the view and moves all keyframes of the window to the past; None, and no change, if it is nowhere.
 
         Args:
-            view: the current one.
             after_gap: the last keyframe is asked, too. Without one, its landmarks are lost because the rig has changed.
         """
         min_points = self.admission.min_points

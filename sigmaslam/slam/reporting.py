@@ -31,7 +31,6 @@ class Reporter:
 
     Attributes:
         rectifier: of the images that are tracked.
-        window, motion: of the tracker.
         relative_poses: relates frames to keyframes.
     """
 

@@ -8,6 +8,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend.lucas_kanade import in_light_of, lucas_kanade
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
@@ -36,11 +37,7 @@ class RigChange:
 
 @dataclass(frozen=True, slots=True)
 class RigWatch:
-    """Looks for bumps where a frame does not fit what was known.
-
-    Attributes:
-        window, localiser, keyframes: of the tracker.
-    """
+    """Looks for bumps where a frame does not fit what was known."""
 
     window: KeyframeWindow
     localiser: Localiser
@@ -50,7 +47,6 @@ class RigWatch:
         """The bump before a frame; None where the left image gives no pose, or the right one fits it as before.
 
         Args:
-            frame: the current one.
             matches: landmarks that were followed to it, with disparities that may be wrong.
             prediction: of its pose.
         """
@@ -79,8 +75,7 @@ class RigWatch:
 def _follow(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(M, 2) each: by how much right places depart from where (u, v, disparity) (K, 3) put those on the left; these."""
     uvd = uvd[np.isfinite(uvd).all(axis=1)]
-    expected = uvd[:, :2] - np.outer(uvd[:, 2], (1.0, 0.0))
-    right = in_light_of(left, right)
+    expected, right = RectifiedStereo.right_pixels(uvd), in_light_of(left, right)
     found, ended = lucas_kanade(left, right, uvd[:, :2], expected, _WINDOW, _LEVELS)
     back, returned = lucas_kanade(right, left, found, uvd[:, :2], _WINDOW, 0)
     good = ended & returned & (np.linalg.norm(back - uvd[:, :2], axis=1) < 1.0)

@@ -56,7 +56,6 @@ def find_second_motion(
     They are held against where the fit's pose sees the landmarks, as if that were a keyframe: `estimate_relative_pose`.
 
     Args:
-        window, matches, fit: of the frame.
         moving: where the scene moves on its own; None: all of it may, but for one body.
     """
     views, camera = matches.views, window.camera
@@ -153,7 +152,10 @@ def find_scene_behind(
 
 
 def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) -> np.ndarray:
-    """(M,) bool, of `others` (K,) those that depart (K pixels), and as many that do not, which stand for most cells."""
+    """(M,) bool, those of `others` (K,) that depart from a pose, and as many that do not, which stand for most cells.
+
+    `departs` (K,) are pixels from where the pose sees them; `cells` (M,) of the image are of all matches.
+    """
     share = 1.0 / np.bincount(cells)[cells[others]]
     same = are_one_place(departs)
     order = np.lexsort((-share, same))

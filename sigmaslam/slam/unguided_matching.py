@@ -28,11 +28,8 @@ class UnguidedMatcher:
     """Finds keyframes in views, wherever they are.
 
     Attributes:
-        camera: the rectified pair.
-        frontend: matches features.
         window: whose calibration corrects the disparities.
         noise: of what is matched.
-        config: settings.
     """
 
     camera: RectifiedStereo

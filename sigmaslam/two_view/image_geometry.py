@@ -156,7 +156,6 @@ def estimate_geometry(
     """Geometry of two images (H, W) uint8.
 
     Args:
-        image0, image1: of one scene.
         models: the cameras that took them; None: unknown.
         known: (4, 4) T_1_0, if the calibration says it.
         frontend, max_keypoints: of `match_images`.

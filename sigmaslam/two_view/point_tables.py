@@ -32,7 +32,6 @@ def triangulate_file(source: Path, camera: StereoCamera, out: Path, method: str,
     Args:
         source: CSV with a header: u0,v0,u1,v1, pixels of the raw left and right image, and if wanted `id` and `sigma`;
             or an .npz of `sigmaslam images match`, left image first, whose covariance of right pixels is taken.
-        camera: the pair.
         out: CSV to write: id,x,y,z in metres and the upper triangle of the covariance.
         method: of `two_view.triangulation.METHODS`; parallel rectifies the pixels.
         sigma: of a coordinate, pixels, where the file does not say.
@@ -81,7 +80,6 @@ def triangulate_pairs(
     """Points (N, 3) in the left camera with covariances (N, 3, 3); NaN where a pixel has no ray or no point.
 
     Args:
-        camera: the pair.
         pixels: (N, 4) of raw images.
         covariance: (N, 4, 4) of them.
         method: of `two_view.triangulation.METHODS`.

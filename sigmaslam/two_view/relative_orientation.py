@@ -158,8 +158,10 @@ def _starts(
 
 @dataclass(frozen=True, slots=True)
 class _Residuals:
-    """Whitened residuals (M,) at a pose and derivatives (M, 5), across epipolar lines (Sampson), and along them of what
-    lies behind infinity; distances (M,) from infinity; and (3, 2) how the direction may move.
+    """Whitened residuals (M,) of matches at a pose, and derivatives (M, 5) by rotation and direction.
+
+    `residual` is across the epipolar lines (Sampson), `behind` along them, of matches that would have to be moved to
+    infinity, else 0; `parallax` (M,) is the distance from there, and `tangent` (3, 2) how the direction may move.
     """
 
     residual: np.ndarray
@@ -249,8 +251,10 @@ def _refine(
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """A refined pose, twice its negative log-likelihood, inliers (M,), variance of their residuals, 1 or more as these
-    are no better than they say, and covariance (5, 5) of rotation and angles of the direction.
+    """A refined pose, and twice its negative log-likelihood, `cost`.
+
+    `scale` is the variance of the residuals of inliers (M,), 1 or more: matches are not taken to be better than they
+    say. The covariance (5, 5) is of rotation and angles of the direction.
     """
 
     R: np.ndarray
@@ -279,7 +283,8 @@ def _fit_places(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pose of points on the plane normal . X = distance (over the baseline's length) by both coordinates in image 1.
 
-    What is free of rotation, direction and normal moves; last come squared errors (M,), and the information of that.
+    Of rotation, angles of the direction and normal those that are `free` move. Last come squared errors (M,) in
+    standard deviations, and the information of what is free.
     """
     normal, inverse = np.zeros(3), np.linalg.inv(rays.spread1 + rays.spread0)
     for turn in range(_WIDE_STEPS + _STEPS):
@@ -307,7 +312,10 @@ def _fit_places(
 
 
 def _turn_alone(rays: MatchedRays, best: _Fit) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rotation and its covariance (3, 3) if the inliers follow a mere turn within their errors, else None."""
+    """Rotation and its covariance (3, 3) if the inliers follow a mere turn within their errors, else None.
+
+    The turn that takes the rays nearest to each other (Kabsch 1976) is as good as the best one where errors are alike.
+    """
     near = rays.chosen(best.inliers)
     R, _, squared, information = _fit_places(near, best.R, best.direction, slice(0, 3))
     variance = float(squared.mean()) / 2.0

@@ -15,7 +15,11 @@ from sigmaslam.two_view.stereo_pose import MIN_POINTS, RelativePose, estimate_re
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """A pose, the share of the image that its inliers stand for, and their median disparity, pixels."""
+    """A pose that explains a part of the matches, its inliers.
+
+    These stand for the share `area` of the image, of each cell for the share of its own matches; `disparity` is their
+    median, pixels.
+    """
 
     pose: RelativePose
     area: float

@@ -1,7 +1,5 @@
 """Relative pose without a prediction (9.5.1): 5-point method with scale from stereo, checked against P3P."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -55,7 +53,7 @@ class RelativePose:
     foreseen: int = 0
     by_calibration: np.ndarray = field(default_factory=lambda: np.zeros((6, CALIBRATION_SIZE)))
 
-    def with_shared_errors(self, calibration: np.ndarray) -> RelativePose:
+    def with_shared_errors(self, calibration: np.ndarray) -> "RelativePose":
         """The same whose covariance has what neighbours share, and the calibration's errors of covariance (15, 15)."""
         shared = self.by_calibration @ calibration @ self.by_calibration.T
         return replace(self, covariance=max(self.clustering, 1.0) * self.covariance + shared)
@@ -78,7 +76,6 @@ def estimate_relative_pose(
     The claimed sigmas are scaled to the errors of half of the points, as matches may be better than claimed.
 
     Args:
-        camera: the rectified pair.
         landmarks: (M, 3) (u, v, disparity) in the keyframe.
         landmark_sigma: (M, 3) their standard deviations, pixels.
         measurement: (M, 3) (u, v, disparity) in the current view; the disparity may be NaN.
@@ -113,12 +110,12 @@ def foresee(
         (M, 3) (u, v, disparity) there, their covariances (M, 3, 3), and whether (M,) each is inside the image.
     """
     predicted, front, by_pose, by_landmark = _project(camera, landmarks, se3_inverse(relative.T_key_camera))
-    covariance = by_pose @ relative.covariance @ by_pose.transpose(0, 2, 1) + _spread(by_landmark, landmark_sigma)
+    covariance = by_pose @ relative.covariance @ by_pose.transpose(0, 2, 1) + _propagated(by_landmark, landmark_sigma)
     u, v = predicted[:, 0], predicted[:, 1]
     return predicted, covariance, front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
 
 
-def _best(matches: _StereoMatches, candidates: list[np.ndarray | None]) -> RelativePose | None:
+def _best(matches: "_StereoMatches", candidates: list[np.ndarray | None]) -> RelativePose | None:
     """Of poses T_camera_key (4, 4) the one with the smallest misfit once refined."""
     guesses = [guess for guess in candidates if guess is not None and np.isfinite(guess).all()]
     if not guesses:
@@ -199,7 +196,7 @@ class _StereoMatches:
         Unknown components, and points behind the camera, have zero information.
         """
         predicted, front, by_pose, by_landmark = _project(self.camera, self.landmarks, T_camera_key)
-        spread = self.noise + _spread(by_landmark, self.landmark_sigma)
+        spread = self.noise + _propagated(by_landmark, self.landmark_sigma)
         residual = self.measurement - predicted
         measured = np.isfinite(residual) & front[:, None]
         present = measured[:, :, None] & measured[:, None, :]
@@ -233,7 +230,10 @@ class _StereoMatches:
 def _project(
     camera: RectifiedStereo, landmarks: np.ndarray, T_camera_key: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where landmarks (M, 3) are seen, and whether in front (M,); derivatives by T from the left, and by landmarks."""
+    """Where landmarks (M, 3) of a keyframe are seen, (M, 3), and whether in front of the camera (M,).
+
+    And the derivatives by a perturbation of T from the left (M, 3, 6) and by the landmark (M, 3, 3).
+    """
     focal = camera.focal_baseline
     # Points are scaled by inverse depth, so that points at infinity are regular.
     rays = camera.rays(landmarks[:, :2])
@@ -255,13 +255,16 @@ def _project(
     return predicted, front, by_pose, by_landmark
 
 
-def _spread(by: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+def _propagated(by: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Covariance (M, 3, 3) by derivatives (M, 3, 3) of what has standard deviations (M, 3)."""
     return (by * (sigma**2)[:, None, :]) @ by.transpose(0, 2, 1)
 
 
 def _refine_pose(matches: _StereoMatches, T_camera_key: np.ndarray, variance: float) -> np.ndarray | None:
-    """Gauss-Newton with a robust loss whose scale shrinks; variances are `variance` times the claimed ones."""
+    """Gauss-Newton with a robust loss whose scale shrinks from step to step; None where points leave the pose open.
+
+    Variances are `variance` times the claimed ones.
+    """
     scale = _FIRST_SCALE
     for _ in range(_STEPS):
         _, normal, gradient = matches.equations(T_camera_key, variance * scale**2)

@@ -135,7 +135,6 @@ def simulate_inertial(
         duration: seconds from the first image, at 0, to the last one.
         rate: samples a second.
         T_truth_world: (4, 4) takes the world to the frame of the true poses.
-        grade: of the sensor.
     """
     grade = grade or InertialGrade()
     R = Rotation.from_quat(rng.standard_normal(4)).as_matrix()

@@ -1,9 +1,7 @@
 """Folders that our readers and other people's tools read: KITTI odometry and EuRoC's ASL format."""
 
-import csv
-import io
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from sigmaslam.calibration_files.foreign_calibrations import write_foreign_calibration
-from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.files import atomic_path, atomic_write_text, csv_text
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti
 from sigmaslam_synthetic.inertial import SimulatedInertial
@@ -55,7 +53,7 @@ def write_inertial(out: Path, simulation: Simulation, inertial: SimulatedInertia
     names = [f"{name}_{axis} [{unit}]" for name, unit in (("w", "rad s^-1"), ("a", "m s^-2")) for axis in "xyz"]
     text = [[stamp, *(f"{value:.9f}" for value in row)] for stamp, row in zip(stamps, rows, strict=True)]
     header = [f"#timestamp [{'s' if is_kitti else 'ns'}]", *names]
-    atomic_write_text(folder / "data.csv", _table(header, text))
+    atomic_write_text(folder / "data.csv", csv_text([header, *text]))
     atomic_write_text(folder / ("data.yaml" if is_kitti else "sensor.yaml"), _inertial_yaml(inertial))
     start = 0.0 if is_kitti else _FIRST_STAMP / 1e9
     save_arrays(folder / "truth.npz", {**asdict(inertial.truth), "timestamp": start + inertial.truth.timestamp})
@@ -97,7 +95,7 @@ def _write_euroc(root: Path, simulation: Simulation, poses: np.ndarray) -> None:
     write_foreign_calibration(root, simulation.rig.calibrated, "euroc")
     rows = [[stamp, f"{stamp}.png"] for stamp in stamps]
     for name in ("cam0", "cam1"):
-        atomic_write_text(root / name / "data.csv", _table(["#timestamp [ns]", "filename"], rows))
+        atomic_write_text(root / name / "data.csv", csv_text([["#timestamp [ns]", "filename"], *rows]))
     truth = root / "state_groundtruth_estimate0"
     truth.mkdir(exist_ok=True)
     orientation = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
@@ -106,7 +104,7 @@ def _write_euroc(root: Path, simulation: Simulation, poses: np.ndarray) -> None:
         [stamp, *(f"{value:.12f}" for value in (*T[:3, 3], *q))]
         for stamp, T, q in zip(stamps, poses, orientation, strict=True)
     ]
-    atomic_write_text(truth / "data.csv", _table(header, rows))
+    atomic_write_text(truth / "data.csv", csv_text([header, *rows]))
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -124,9 +122,3 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 def _stamp(simulation: Simulation, frame: int) -> int:
     return _FIRST_STAMP + round(1e9 * frame / simulation.fps)
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([header, *rows])
-    return text.getvalue()

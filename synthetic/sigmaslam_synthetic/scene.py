@@ -3,8 +3,6 @@
 World axes: z up. Light is linear; a white surface under the sun at right angles has radiance 1 before exposure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -146,7 +144,7 @@ class Scene:
         }
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Scene:
+    def from_json(cls, content: Mapping[str, Any]) -> "Scene":
         """The scene that `to_json` wrote.
 
         Raises:

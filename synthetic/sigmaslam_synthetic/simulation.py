@@ -1,7 +1,5 @@
 """All that a rendered sequence is made of; any of its frames can be made alone, again, and in any process."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -12,7 +10,7 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam_synthetic.camera.rig import Miscalibration, Rig
 from sigmaslam_synthetic.camera.sensor import Sensor, expose, exposure_gains
-from sigmaslam_synthetic.inertial import InertialGrade, SimulatedInertial, simulate_inertial
+from sigmaslam_synthetic.inertial import SimulatedInertial, simulate_inertial
 from sigmaslam_synthetic.motion.paths import Path
 from sigmaslam_synthetic.presets import EXPOSURES, PRESETS, SENSORS, Layout
 from sigmaslam_synthetic.render_choices import CARRIED, MOTIONS, ROLLING
@@ -147,7 +145,7 @@ class Simulation:
         }
 
     @classmethod
-    def from_json(cls, content: dict[str, Any]) -> Simulation:
+    def from_json(cls, content: dict[str, Any]) -> "Simulation":
         """The simulation that `to_json` wrote."""
         return cls(
             Scene.from_json(content["scene"]),
@@ -219,13 +217,13 @@ def simulate(recipe: Recipe) -> Simulation:
     return replace(draft, sensor=replace(sensor, gain=_metered_gain(draft)))
 
 
-def inertial_of(recipe: Recipe, simulation: Simulation, grade: InertialGrade | None = None) -> SimulatedInertial:
+def inertial_of(recipe: Recipe, simulation: Simulation) -> SimulatedInertial:
     """What the inertial sensor of a recipe measures, in the frame of the true poses that the layout has."""
     assert recipe.imu is not None
     rng = np.random.default_rng((recipe.seed, _INERTIAL))
     path, is_kitti = simulation.path, simulation.layout == "kitti"
     T_truth_world = np.linalg.inv(path.poses(0.0)) if is_kitti else np.eye(4)
-    return simulate_inertial(path, float(simulation.times[-1]), recipe.imu, rng, T_truth_world, grade)
+    return simulate_inertial(path, float(simulation.times[-1]), recipe.imu, rng, T_truth_world)
 
 
 class Studio:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
+from sigmaslam.files import save_arrays
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
@@ -19,7 +20,6 @@ from sigmaslam.run_record.relative_pose_file import (
     RelativePoseWriter,
     collect_frame_pairs,
     read_frame_pairs,
-    write_frame_pairs,
 )
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
@@ -191,7 +191,7 @@ def test_the_file_round_trips(tmp_path: Path):
     for frame in range(20):
         writer.add(frame, rows.get(frame, RelativePoses.empty()))
     writer.close()
-    write_frame_pairs(tmp_path / "relative_poses.npz", collect_frame_pairs(tmp_path, times))
+    save_arrays(tmp_path / "relative_poses.npz", **collect_frame_pairs(tmp_path, times).arrays())
     pairs = read_frame_pairs(tmp_path / "relative_poses.npz", 20)
     assert pairs.span.tolist() == [SPANS[4], SPANS[0], SPANS[6]]
     assert (pairs.earlier.tolist(), pairs.later.tolist()) == ([0, 3, 17], [5, 5, 19])
@@ -201,7 +201,7 @@ def test_the_file_round_trips(tmp_path: Path):
 
 def test_files_of_other_runs_and_other_files_are_refused(tmp_path: Path):
     path = tmp_path / "relative_poses.npz"
-    write_frame_pairs(path, pairs_of(winding_path(30), {"1 s": 10}))
+    save_arrays(path, **pairs_of(winding_path(30), {"1 s": 10}).arrays())
     with pytest.raises(InputError, match=r"relative_poses\.npz: has frame 29, but .* 20 poses"):
         read_frame_pairs(path, 20)
     np.savez(path, span=np.zeros(3))
@@ -219,7 +219,7 @@ def run(tmp_path: Path) -> tuple[Path, Path]:
     (tmp_path / "run").mkdir()
     write_tum(tmp_path / "truth.tum", truth)
     write_tum(tmp_path / "run" / "trajectory.tum", truth)
-    write_frame_pairs(tmp_path / "run" / "relative_poses.npz", pairs_of(truth, {"10 m": 10, "5 s": 50}))
+    save_arrays(tmp_path / "run" / "relative_poses.npz", **pairs_of(truth, {"10 m": 10, "5 s": 50}).arrays())
     return tmp_path / "run", tmp_path / "truth.tum"
 
 
@@ -277,7 +277,7 @@ def test_a_followed_body_is_judged_in_its_own_frame(tmp_path: Path):
     run.mkdir()
     write_tum(run / "trajectory.tum", Trajectory(camera.timestamps, body))
     (run / "run.json").write_text(json.dumps({"object": {}}))
-    write_frame_pairs(run / "relative_poses.npz", pairs_of(camera, {"1 s": 10}))
+    save_arrays(run / "relative_poses.npz", **pairs_of(camera, {"1 s": 10}).arrays())
     write_tum(tmp_path / "truth.tum", truth)
     relative = evaluate_run(
         run, tmp_path / "truth.tum", plot=False, truth_sigma_position=0.02, truth_sigma_rotation=0.1

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sigmaslam.files import save_arrays
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
-from sigmaslam.run_record.relative_pose_file import FramePairs, write_frame_pairs
+from sigmaslam.run_record.relative_pose_file import FramePairs
 from sigmaslam_benchmarks.tracking.three_cornered_hat import format_hat, own_parts
 
 SIGMAS = {"truth": 0.3, "ours": 0.02, "cuvslam": 0.05, "klt-pnp": 0.1}
@@ -53,7 +54,7 @@ def test_the_table_has_a_row_for_each_source_and_what_ours_says(tmp_path: Path):
     relative = se3_inverse(poses[earlier]) @ poses[earlier + 100]
     said = np.tile(0.25 * np.eye(6), (300, 1, 1))
     pairs = FramePairs(np.full(300, "100 m"), earlier, earlier + 100, relative, said)
-    write_frame_pairs(tmp_path / "ours" / "relative_poses.npz", pairs)
+    save_arrays(tmp_path / "ours" / "relative_poses.npz", **pairs.arrays())
     rows = [line.split(" | ") for line in format_hat(tmp_path, Trajectory(exact.timestamps, measured)).splitlines()]
     of_100_m = {row[1]: row[2:] for row in rows if "100 m, 295 pairs" in row[0]}
     assert float(of_100_m["truth, own part"][1]) == pytest.approx(0.05 * np.sqrt(2.0), rel=0.1)

@@ -21,6 +21,7 @@ from sigmaslam.calibration_files.kitti_calibration import read_kitti_calibration
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
+from sigmaslam.files import save_arrays
 from sigmaslam.frontend import Features, StereoView
 from sigmaslam.fusion.readings import read_locations
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
@@ -31,7 +32,7 @@ from sigmaslam.readers.images import read_grey
 from sigmaslam.readers.pairing import read_times
 from sigmaslam.readers.trajectory_files import read_covariances, read_trajectory
 from sigmaslam.run_record.frame_table import COLUMNS, read_frames
-from sigmaslam.run_record.relative_pose_file import FramePairs, read_frame_pairs, write_frame_pairs
+from sigmaslam.run_record.relative_pose_file import FramePairs, read_frame_pairs
 from sigmaslam.slam.config import read_config
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
@@ -243,7 +244,7 @@ def _relative(folder: Path) -> bytes:
     frames = np.arange(3)
     poses, covariances = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(6), (3, 1, 1))
     path = folder / "seed.npz"
-    write_frame_pairs(path, FramePairs(np.array(["1 m"] * 3), frames, frames + 1, poses, covariances))
+    save_arrays(path, **FramePairs(np.array(["1 m"] * 3), frames, frames + 1, poses, covariances).arrays())
     return path.read_bytes()
 
 

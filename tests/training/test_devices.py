@@ -83,8 +83,7 @@ def first_gradient(config, rank: int, ranks: int, frozen: bool = False) -> list[
     torch.manual_seed(config.seed)
     network = FeatureNetwork().train(not frozen)
     network.to(memory_format=torch.channels_last)
-    batch_size, points = config.batch_size, config.points
-    loader = pair_loader("leaves", 0, config.size, 0, batch_size, points, batch_size, 0, rank, ranks)
+    loader = pair_loader(replace(config, steps=1, data="leaves", seed=0), 0, 0, rank, ranks)
     loss = NetworkLoss(network)(next(iter(loader)), torch.Generator().manual_seed(rank * 500_000_003))
     (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
     return [parameter.grad for parameter in network.parameters()]

@@ -9,6 +9,7 @@ import torch
 from sigmaslam.errors import InputError
 from sigmaslam_synthetic import homography_pairs
 from sigmaslam_training.features import stream
+from sigmaslam_training.features.recipes import TrainingConfig
 from sigmaslam_training.features.stream import MixedPairs, PairDataset, open_stream, pair_loader
 from sigmaslam_training.mixes import MIXES
 
@@ -19,8 +20,9 @@ def small_textures(monkeypatch):
 
 
 def test_batches_do_not_depend_on_where_the_loader_begins():
-    whole = list(pair_loader("leaves", 0, 96, 0, 6, 16, 2, workers=0))
-    rest = list(pair_loader("leaves", 0, 96, 4, 6, 16, 2, workers=0))
+    config = TrainingConfig(steps=3, batch_size=2, size=96, points=16)
+    whole = list(pair_loader(config, 0, workers=0))
+    rest = list(pair_loader(config, 2, workers=0))
     assert len(whole) == 3
     assert len(rest) == 1
     for a, b in zip(whole[2], rest[0], strict=True):
@@ -28,7 +30,8 @@ def test_batches_do_not_depend_on_where_the_loader_begins():
 
 
 def test_keypoints_lie_in_the_image_and_have_the_promised_number():
-    image0, image1, keypoints0, places1, visible, keypoints1 = PairDataset("leaves", 0, 96, 0, 4, keypoints=300)[3]
+    pairs = PairDataset(TrainingConfig(steps=4, batch_size=1, size=96, points=300), 0)
+    image0, image1, keypoints0, places1, visible, keypoints1 = pairs[3]
     assert image0.shape == image1.shape == (1, 96, 96)
     assert places1.shape == (300, 2)
     assert visible.shape == (300,)
@@ -42,7 +45,7 @@ def test_keypoints_lie_in_the_image_and_have_the_promised_number():
         assert keypoints.min() >= 0
         assert keypoints.max() <= 95
     with pytest.raises(IndexError):
-        PairDataset("leaves", 0, 96, 0, 4, keypoints=300)[4]
+        pairs[4]
 
 
 def test_sources_of_a_mix_take_turns_and_see_neighbouring_numbers(monkeypatch):
@@ -72,8 +75,9 @@ def test_an_unknown_mix_is_refused():
 @pytest.mark.long
 @pytest.mark.parametrize("ranks", [2, 4])
 def test_shares_of_the_processes_make_up_the_batches_of_one(ranks):
-    whole = list(pair_loader("leaves", 0, 96, 4, 12, 16, 4, workers=0))
-    shares = [list(pair_loader("leaves", 0, 96, 4, 12, 16, 4, 0, rank, ranks)) for rank in range(ranks)]
+    config = TrainingConfig(steps=3, batch_size=4, size=96, points=16)
+    whole = list(pair_loader(config, 1, workers=0))
+    shares = [list(pair_loader(config, 1, 0, rank, ranks)) for rank in range(ranks)]
     for index, batch in enumerate(whole):
         for part, expected in enumerate(batch):
             found = torch.stack([share[index][part] for share in shares], dim=1).flatten(0, 1)
@@ -114,8 +118,9 @@ def test_endoscopy_shows_the_inside_of_bodies_alone():
 def test_workers_make_the_same_batches_after_this_process_has_computed(monkeypatch):
     """Forked workers would wait for ever: drawing a sample before the first step did that."""
     monkeypatch.undo()  # workers know nothing of the small textures
-    alone = list(pair_loader("leaves", 0, 96, 0, 4, 16, 2, workers=0))
-    helped = list(pair_loader("leaves", 0, 96, 0, 4, 16, 2, workers=1))
+    config = TrainingConfig(steps=2, batch_size=2, size=96, points=16)
+    alone = list(pair_loader(config, 0, workers=0))
+    helped = list(pair_loader(config, 0, workers=1))
     for batch, other in zip(alone, helped, strict=True):
         for a, b in zip(batch, other, strict=True):
             assert torch.equal(a, b)

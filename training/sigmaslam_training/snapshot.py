@@ -41,7 +41,6 @@ def write_snapshot(
     """Writes everything that changes while a training lasts; the file appears whole or not at all.
 
     Args:
-        path: of the file.
         network, optimizer, schedule: in training.
         step: steps that are done.
         facts: to be kept beside them, as JSON.
@@ -53,8 +52,13 @@ def write_snapshot(
     tensors["random.torch"] = torch.get_rng_state()
     metadata = {**facts, "step": step, "optimizer": state["param_groups"], "schedule": schedule.state_dict()}
     written = {"format": _FORMAT, **{name: json.dumps(value) for name, value in metadata.items()}}
+    save_tensors(path, tensors, written)
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Writes tensors by name as .safetensors; the file appears whole or not at all."""
     with atomic_path(path) as temporary:
-        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, temporary, written)
+        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, temporary, metadata)
 
 
 def read_snapshot(path: Path) -> Snapshot:

@@ -135,10 +135,10 @@ def _problem(work: Work) -> _PeerProblem:
     measure: Model = _position
     measure_inputs = no_inputs
     if isinstance(work, StereoWork):
-        transition, transition_inputs = _advance, work.transition
+        transition, transition_inputs = lambda xp, states, inputs: advance(states, inputs), work.transition
         measure, measure_inputs = project_stereo, work.points
     elif isinstance(work, LandmarkWork):
-        transition, transition_inputs = _stay, no_inputs
+        transition, transition_inputs = lambda xp, states, inputs: states, no_inputs
         measure = _project_landmark
     else:
         transition_inputs = work.control
@@ -157,14 +157,6 @@ def _problem(work: Work) -> _PeerProblem:
         measure,
         measure_inputs,
     )
-
-
-def _stay(xp: Any, states: Any, inputs: Any) -> Any:
-    return states
-
-
-def _advance(xp: Any, states: Any, inputs: Any) -> Any:
-    return advance(states, inputs)
 
 
 def _position(xp: Any, states: Any, inputs: Any) -> Any:

@@ -35,6 +35,7 @@ _QUANTITIES = (
 )
 # Tables beside the page, by their names.
 _ASIDE = {
+    "Frames tracked": "tracked",
     "t_rel, %": "t_rel",
     "Step error, mm": "steps",
     "Forward noise, mm": "forward",

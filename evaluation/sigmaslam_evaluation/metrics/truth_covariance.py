@@ -1,7 +1,5 @@
 """Covariances of true poses, where the truth was measured, too."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -32,7 +30,7 @@ class TruthErrors:
         ends = (factors * each[rows] * factors.swapaxes(1, 2) for rows in (earlier, later))
         return relative_truth_covariance(se3_inverse(truth.poses[earlier]) @ truth.poses[later], *ends)
 
-    def turned(self, T: np.ndarray) -> TruthErrors:
+    def turned(self, T: np.ndarray) -> "TruthErrors":
         """In body frames that T (4, 4), or (K, 4, 4), takes the bodies' points into."""
         return replace(self, covariance=turn_covariance(T, self.covariance))
 

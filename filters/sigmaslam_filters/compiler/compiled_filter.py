@@ -1,7 +1,5 @@
 """A filter over whole sequences as machine code."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -34,7 +32,7 @@ def compile_filter(
     *,
     gate: float | None = None,
     robust: Robust | None = None,
-) -> CompiledFilter:
+) -> "CompiledFilter":
     """`filter_events` as machine code, and `filter` of a motion and a measurement, for any number of steps.
 
     For up to `LARGEST_SCALAR_BATCH` filters each kind of event is a function of scalars, see

@@ -101,7 +101,6 @@ class _Entries:
     Attributes:
         numbers: of its shape, but of length 1 along the batch: which of the rewriter's entries stands there.
         axis: the batch's dimension, None if there is none.
-        dtype: of the tensor.
         source: the tensor itself, if it is there.
     """
 

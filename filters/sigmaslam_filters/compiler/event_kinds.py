@@ -154,7 +154,6 @@ def grouped(
     and no derivative by it is asked for; else it is an input. What was an input once stays one.
 
     Args:
-        bayes: the filter.
         streams: all of a sequence.
         by_root: whether beliefs are held by roots.
         varying: keys of tensors that are inputs, to which more are added.

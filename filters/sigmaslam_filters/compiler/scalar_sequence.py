@@ -1,7 +1,5 @@
 """Scalar steps of several kinds over time, one element after the other, and the gradient of it by the adjoint steps."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -50,7 +48,7 @@ class _Array(ctypes.Structure):
     _fields_ = (("start", ctypes.c_void_p), ("by_time", ctypes.c_int64), ("by_element", ctypes.c_int64))
 
     @classmethod
-    def of(cls, given: Tensor) -> _Array:
+    def of(cls, given: Tensor) -> "_Array":
         """Of (T, B, ...) contiguous; a length of 1 is for all times, or all elements."""
         size = given[0, 0].numel() * given.element_size() if given.numel() else 0
         times, batch = given.shape[:2]
@@ -72,7 +70,7 @@ class CompiledStep:
         self._functions: dict[tuple[bool, ...], Any] = {}
 
     @classmethod
-    def of(cls, scalar: ScalarStep, slots: Sequence[int]) -> CompiledStep:
+    def of(cls, scalar: ScalarStep, slots: Sequence[int]) -> "CompiledStep":
         """Of a step that was traced, with derivatives."""
         return cls(scalar.source, slots, scalar.adjoint_source)
 

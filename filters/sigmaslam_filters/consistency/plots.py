@@ -1,7 +1,5 @@
 """Figures of `sigmaslam_filters.consistency.statistics`; save them with `Figure.savefig`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

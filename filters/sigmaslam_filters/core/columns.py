@@ -1,7 +1,5 @@
 """Deviations of values as columns: their outer products add up to a covariance, and stacked they are a root of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -35,11 +33,11 @@ class Columns:
         covariance = square(self.all())
         return covariance if self.negative is None else covariance - square([self.negative])
 
-    def where(self, usable: Tensor) -> Columns:
+    def where(self, usable: Tensor) -> "Columns":
         """The columns where usable (...,) bool is true, zeros elsewhere."""
         return self._with_zeros(usable[..., None, None])
 
-    def masked(self, mask: Tensor, unit_noise: bool) -> Columns:
+    def masked(self, mask: Tensor, unit_noise: bool) -> "Columns":
         """Zero rows where the mask (..., m) is False; with unit noise of their own if no noise is added to them."""
         masked = self._with_zeros(mask.unsqueeze(-1))
         if not unit_noise:
@@ -48,13 +46,13 @@ class Columns:
         unit = torch.diag_embed((~mask).to(odd.dtype)).expand(*odd.shape[:-1], odd.shape[-2])
         return Columns(odd, unit if even is None else join([even, unit]), masked.negative)
 
-    def without_noise(self, size: int) -> Columns:
+    def without_noise(self, size: int) -> "Columns":
         """Of a transform of state and noise: odd columns after the first `size` are the noise's, and become even."""
         noise = self.odd[..., size:]
         even = noise if self.even is None else join([noise, self.even])
         return Columns(self.odd[..., :size], even, self.negative)
 
-    def _with_zeros(self, kept: Tensor) -> Columns:
+    def _with_zeros(self, kept: Tensor) -> "Columns":
         odd = torch.where(kept, self.odd, 0.0)
         even = None if self.even is None else torch.where(kept, self.even, 0.0)
         negative = None if self.negative is None else torch.where(kept, self.negative, 0.0)

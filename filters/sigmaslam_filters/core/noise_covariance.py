@@ -1,7 +1,5 @@
 """Noise of motions and measurements: dense, diagonal or block-diagonal covariances that whiten at their own cost."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -30,11 +28,11 @@ class Noise(ABC):
     def __repr__(self) -> str:
         return f"{type(self).__name__}{tuple(self.variance().shape)}"
 
-    def masked(self, mask: Tensor) -> Noise:
+    def masked(self, mask: Tensor) -> "Noise":
         """The noise with unit variance, and no correlation, where mask (..., m) is False."""
         return Dense(_masked(self.covariance(), mask))
 
-    def scaled(self, factor: Tensor) -> Noise:
+    def scaled(self, factor: Tensor) -> "Noise":
         """The noise of components that are multiplied by factors (..., m)."""
         return Dense(self.covariance() * (factor.unsqueeze(-1) * factor.unsqueeze(-2)))
 
@@ -98,11 +96,11 @@ class Diagonal(Noise):
         """log |R|, (...,)."""
         return torch.log(self._variance).sum(dim=-1)
 
-    def masked(self, mask: Tensor) -> Diagonal:
+    def masked(self, mask: Tensor) -> "Diagonal":
         """Unit variance where mask (..., m) is False."""
         return Diagonal(torch.where(mask, self._variance, 1.0))
 
-    def scaled(self, factor: Tensor) -> Diagonal:
+    def scaled(self, factor: Tensor) -> "Diagonal":
         """The noise of components that are multiplied by factors (..., m)."""
         return Diagonal(self._variance * (factor * factor))
 
@@ -147,11 +145,11 @@ class BlockDiagonal(Noise):
         """log |R|, (...,)."""
         return self._blocks.log_determinant().sum(dim=-1)
 
-    def masked(self, mask: Tensor) -> BlockDiagonal:
+    def masked(self, mask: Tensor) -> "BlockDiagonal":
         """Unit variance and no correlation where mask (..., m) is False."""
         return BlockDiagonal(_masked(self._blocks.covariance(), mask.unflatten(-1, self._shape)))
 
-    def scaled(self, factor: Tensor) -> BlockDiagonal:
+    def scaled(self, factor: Tensor) -> "BlockDiagonal":
         """The noise of components that are multiplied by factors (..., m)."""
         parts = factor.unflatten(-1, self._shape)
         return BlockDiagonal(self._blocks.covariance() * (parts.unsqueeze(-1) * parts.unsqueeze(-2)))

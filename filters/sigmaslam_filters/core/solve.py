@@ -10,8 +10,6 @@ covariance is S = odd odd^T + even even^T + R, and odd is its covariance with ze
   Twice the digits: the form for float32 (R7).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -66,7 +64,7 @@ class TangentPosterior:
     matrix: Tensor | None
     healthy: Tensor | None
 
-    def where(self, chosen: Tensor, other: TangentPosterior) -> TangentPosterior:
+    def where(self, chosen: Tensor, other: "TangentPosterior") -> "TangentPosterior":
         """This solution where chosen (...,) bool is true, the other of the same form elsewhere."""
 
         def pick(first: Tensor | None, second: Tensor | None, trailing: int) -> Tensor | None:

@@ -117,10 +117,6 @@ def _acos(x: Tensor) -> Tensor:
     return _atan2(torch.sqrt((1.0 - x) * (1.0 + x)), x)
 
 
-def _tan(x: Tensor) -> Tensor:
-    return torch.sin(x) / torch.cos(x)
-
-
 def _copysign(size: Tensor, sign: Tensor) -> Tensor:
     """Of a negative zero the sign is lost."""
     return torch.where(sign < 0, -size.abs(), size.abs())
@@ -133,18 +129,6 @@ def _sinc(x: Tensor) -> Tensor:
     return torch.where(zero, torch.ones_like(angle), torch.sin(safe) / safe)
 
 
-def _log2(x: Tensor) -> Tensor:
-    return torch.log(x) * _exact(1.0 / math.log(2.0), x)
-
-
-def _log10(x: Tensor) -> Tensor:
-    return torch.log(x) * _exact(1.0 / math.log(10.0), x)
-
-
-def _signbit(x: Tensor) -> Tensor:
-    return x < 0
-
-
 _REPLACED: Mapping[str, Callable[..., Tensor]] = {
     "hypot": _hypot,
     "atan2": _atan2,
@@ -155,13 +139,13 @@ _REPLACED: Mapping[str, Callable[..., Tensor]] = {
     "arcsin": _asin,
     "acos": _acos,
     "arccos": _acos,
-    "tan": _tan,
+    "tan": lambda x: torch.sin(x) / torch.cos(x),
     "copysign": _copysign,
-    "signbit": _signbit,
+    "signbit": lambda x: x < 0,
     "sinc": _sinc,
     "special_sinc": _sinc,
-    "log2": _log2,
-    "log10": _log10,
+    "log2": lambda x: torch.log(x) * _exact(1.0 / math.log(2.0), x),
+    "log10": lambda x: torch.log(x) * _exact(1.0 / math.log(10.0), x),
 }
 
 # By the name under which torch calls a function; a number among their arguments may be a tensor as well.

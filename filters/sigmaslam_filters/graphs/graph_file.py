@@ -1,7 +1,5 @@
 """Files of ONNX graphs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +7,7 @@ if TYPE_CHECKING:
     import onnx_ir
 
 
-def simplify(model: onnx_ir.Model) -> None:
+def simplify(model: "onnx_ir.Model") -> None:
     """Folds constants and takes out what is unused or there twice, in place, without a change of any number.
 
     `torch.onnx.export(optimize=True)` also drops sums with a constant below 1e-8 in size and products with one within

@@ -1,7 +1,5 @@
 """First derivatives of a space's two functions along tangents: closed forms of its own, or by differentiation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -38,7 +36,7 @@ class TangentMaps(Protocol):
         ...
 
 
-def tangent_maps(space: Space) -> TangentMaps:
+def tangent_maps(space: "Space") -> TangentMaps:
     """The space's own closed forms, or its derivatives."""
     return space if isinstance(space, TangentMaps) else Differentiated(space)
 
@@ -51,7 +49,7 @@ class Differentiated:
         space: its two functions must be differentiable.
     """
 
-    space: Space
+    space: "Space"
 
     def push_retract(self, point: Tensor, change: Tensor) -> Tensor:
         """See `TangentMaps`."""

@@ -66,7 +66,7 @@ def estimator_graphs() -> dict[str, TracedModule]:
                 *("position_change", "slope", "noise", "walk"),
             ],
             ["predicted_pose", "predicted_velocity", "predicted_covariance", "carried"],
-            ((fixed,) * 12,),
+            (fixed,) * 12,
         ),
         "frame_predict": _step_graph(PredictViews(), (), PREDICTED, of_frame=True),
         "frame_robust": _step_graph(RobustStep(), ROBUST_INPUTS, ROBUST_OUTPUTS, of_frame=True),

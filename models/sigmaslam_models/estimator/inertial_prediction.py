@@ -35,19 +35,33 @@ class InertialPredict(nn.Module):
         float64. The root may be singular: a graph takes 3 ms for one of its own.
     """
 
-    def forward(self, *given: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(
+        self,
+        pose: Tensor,
+        velocity: Tensor,
+        gravity: Tensor,
+        mounting: Tensor,
+        root: Tensor,
+        seconds: Tensor,
+        turn: Tensor,
+        velocity_change: Tensor,
+        position_change: Tensor,
+        slope: Tensor,
+        noise: Tensor,
+        walk: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sigma points through the motion; noise is added after."""
-        (*start, root), motion, (noise, walk) = given[:5], given[5:10], given[10:]
+        motion = pose, velocity, gravity, mounting, seconds, turn, velocity_change, position_change, slope
         # One evaluation of all points, the centre last: a graph spends its time on operators, not on their rows.
         with ExactOperators():
             points = cubature().offsets(root, with_centre=True)
-            camera, v, body = moved_by_sensor((*start, *motion), points)
+            camera, v, body = moved_by_sensor(motion, points)
             predicted, speed = camera[-1], v[-1]
             local = torch.cat([log_se3(camera @ invert_se3(predicted)), v - speed, points[:, 9:]], dim=-1)[:-1]
             mean = cubature().mean(local, STATE_SIZE, with_centre=False)
             columns = cubature().deviations(local, mean, STATE_SIZE, with_centre=False)
             spread, carried = columns.covariance(), root @ columns.odd.transpose(0, 1)
-        added = sensor_noise((start[0] @ start[3])[:3, :3], body[-1], noise, walk * motion[0])
+        added = sensor_noise((pose @ mounting)[:3, :3], body[-1], noise, walk * seconds)
         return exp_se3(mean[POSE]) @ predicted, speed + mean[VELOCITY], spread + added, carried
 
 

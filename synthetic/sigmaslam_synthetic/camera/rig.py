@@ -1,7 +1,5 @@
 """The stereo camera as it is and as its calibration says: the two differ by what real calibrations get wrong."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -77,7 +75,7 @@ class Rig:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, content: dict[str, Any]) -> Rig:
+    def from_json(cls, content: dict[str, Any]) -> "Rig":
         """The rig that `to_json` wrote."""
         errors = {**content["errors"], "rotation": tuple(content["errors"]["rotation"])}
         return cls(
@@ -102,7 +100,6 @@ def loose_rig(
         camera: the left camera.
         baseline: metres.
         rng: source of the differences.
-        errors: of the calibration.
     """
     R = Rotation.from_rotvec(np.deg2rad(_LOOSE_DEGREES) * rng.standard_normal(3)).as_matrix()
     T = rigid_motion(R, baseline * np.array([1.0, *(_LOOSE_SHARE * rng.standard_normal(2))]))

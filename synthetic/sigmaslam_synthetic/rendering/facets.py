@@ -1,7 +1,5 @@
 """What the renderer draws: flat facets, each a parallelogram or a triangle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -32,7 +30,7 @@ class Facets(Table):
     closed: np.ndarray
     surface: np.ndarray
 
-    def placed(self, T: np.ndarray) -> Facets:
+    def placed(self, T: np.ndarray) -> "Facets":
         """The same facets after a rigid motion T (4, 4)."""
         R = T[:3, :3]
         origin = self.origin @ R.T + T[:3, 3]

@@ -56,7 +56,6 @@ class Renderer:
     """A scene made ready to be looked at.
 
     Args:
-        scene: what there is.
         device: where it is drawn.
     """
 

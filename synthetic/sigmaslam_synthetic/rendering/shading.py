@@ -1,7 +1,5 @@
 """What light comes from a point that is seen: texture filtered over the pixel's footprint, sun, lamp, highlights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,7 +31,7 @@ class Samples(NamedTuple):
     places: Tensor
     spacing: Tensor | None
 
-    def part(self, index: slice) -> Samples:
+    def part(self, index: slice) -> "Samples":
         """Some of them."""
         spacing = None if self.spacing is None else self.spacing[index]
         return Samples(self.view[index], self.facet[index], self.places[:, index], spacing)
@@ -69,7 +67,7 @@ class _Look(NamedTuple):
     gloss: Tensor
     bump: Tensor
 
-    def at(self, index: Tensor) -> _Look:
+    def at(self, index: Tensor) -> "_Look":
         """Of some of the samples."""
         return _Look(*(column[..., index] for column in self))
 
@@ -96,7 +94,6 @@ class Shader:
         facets: all facets, in the frame of their mover.
         body, mover: (F,) int of each facet.
         materials: of each body.
-        lights: of the scene.
         sky: its radiance.
         device: where shading runs.
     """

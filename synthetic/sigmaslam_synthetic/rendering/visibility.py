@@ -125,8 +125,6 @@ class Sight:
     """What V views with the same eye see.
 
     Args:
-        surfaces: what there is.
-        eye: the camera.
         T_view_mover: (V, M, 4, 4) float64.
         near: nearest distance seen.
         only: (n,) int64 facets that there are, all unless given.

@@ -40,8 +40,9 @@ class Palette:
         """Materials that things may choose from, as palettes.yaml has them."""
         rng, (dark, bright) = self._rng, brightness
         for k in range(count):
+            seeds = {kind: self._textures[kind][k % len(self._textures[kind])].seed for kind, _, _ in layers}
             chosen = tuple(
-                Texture(kind, self._pick(kind, k), tile * float(rng.uniform(0.8, 1.25)), _CONTRAST * contrast)
+                Texture(kind, seeds[kind], tile * float(rng.uniform(0.8, 1.25)), _CONTRAST * contrast)
                 for kind, tile, contrast in layers
             )
             self._groups.setdefault(group, []).append(len(self.materials))
@@ -51,9 +52,6 @@ class Palette:
         """Index of a material of the group."""
         members = self._groups[group]
         return members[int(self._rng.integers(len(members)))]
-
-    def _pick(self, kind: str, k: int) -> int:
-        return self._textures[kind][k % len(self._textures[kind])].seed
 
 
 @cache

@@ -71,10 +71,6 @@ def _grounded(path: Path, road: Road) -> Path:
     height = positions[:, 2] - CAMERA_HEIGHT
     # What the springs do stays; what the ground does is the ground's.
     seconds = max(len(positions) * 1.5 / max(path.end, 1.5), 1e-3)
-    bounce = height - _smooth(height, seconds)
+    bounce = height - gaussian_filter1d(height, seconds, mode="reflect")
     positions[:, 2] = road.smooth_ground(positions[:, :2]) + CAMERA_HEIGHT + np.clip(bounce, -0.04, 0.04)
     return replace(path, positions=positions)
-
-
-def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
-    return np.asarray(gaussian_filter1d(values, sigma, mode="reflect"))

@@ -83,9 +83,10 @@ def wall(rng: np.random.Generator, palette: Palette, long: float) -> Model:
         return (Part(Box((long, 0.06, high + 0.4)), palette.choose("wood"), (0.0, 0.0, high / 2 - 0.2)),)
     rail, post = palette.choose("metal"), palette.choose("dark")
     count = int(long / 0.6)
+    even = ((np.arange(count) + 0.5) / count - 0.5) * long
     return (
         *(Part(Box((long, 0.05, 0.06)), rail, (0.0, 0.0, z * high)) for z in (0.25, 0.95)),
-        *(Part(Panel(0.06, high), post, (x, 0.01, high / 2), _FACING_STREET) for x in _even(long, count)),
+        *(Part(Panel(0.06, high), post, (x, 0.01, high / 2), _FACING_STREET) for x in even),
     )
 
 
@@ -120,7 +121,3 @@ def _balcony(rng: np.random.Generator, palette: Palette, x: float, front: float,
 def _spread(rng: np.random.Generator, wide: float, count: int) -> np.ndarray:
     """Places along a front of that width."""
     return np.asarray((np.arange(count) + 0.5 + rng.uniform(-0.2, 0.2, count)) / count * wide - wide / 2) * 0.85
-
-
-def _even(long: float, count: int) -> list[float]:
-    return list(((np.arange(count) + 0.5) / count - 0.5) * long)

@@ -129,7 +129,7 @@ class Road:
         """Takes the places of a footprint (N, 2) if they are free and at least `clearance` from any lane's middle."""
         if self.distance(footprint).min() < clearance:
             return False
-        cells = self._cells_of(footprint)
+        cells = np.clip((footprint - self._low).astype(int), 0, np.array(self._taken.shape) - 1)
         if self._taken[cells[:, 0], cells[:, 1]].any():
             return False
         self._taken[cells[:, 0], cells[:, 1]] = True
@@ -178,9 +178,6 @@ class Road:
         off = np.clip((self._tree.query(lines)[0] - 14.0) / 30.0, 0.0, 1.0).reshape(shape)
         hills = noise(rng, x, 1, 1 / 200, 1 / 50) + noise(rng, y, 1, 1 / 200, 1 / 50).T
         return np.asarray(surface + 0.8 * off * hills)
-
-    def _cells_of(self, points: np.ndarray) -> np.ndarray:
-        return np.clip((points - self._low).astype(int), 0, np.array(self._taken.shape) - 1)
 
     @staticmethod
     def _left(heading: np.ndarray) -> np.ndarray:

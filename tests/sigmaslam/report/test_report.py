@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
+from sigmaslam.files import save_arrays
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.evaluated_frames import EvaluatedFrames, write_evaluation
 from sigmaslam.run_record.frame_table import STATUSES, read_frames
 from sigmaslam.run_record.recorded_run import read_run
-from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs, write_frame_pairs
+from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, FramePairs
 from tests.support.pages import Page, unpack
 from tests.support.recorded_runs import HEADER, STAGES, make_run
 
@@ -164,7 +165,7 @@ def test_labels_and_head_say_how_well_the_last_second_is_known(tmp_path):
     pairs = FramePairs(
         np.array(["1 s", "1 m"]), np.zeros(2, int), np.full(2, 30), np.stack([np.eye(4)] * 2), [covariance] * 2
     )
-    write_frame_pairs(tmp_path / "run" / RELATIVE_POSES_NAME, pairs)
+    save_arrays(tmp_path / "run" / RELATIVE_POSES_NAME, **pairs.arrays())
     page = _page(tmp_path / "run")
     labels = page.data["scenes"][0]["labels"]
     assert labels[30].endswith("; over a second 5 mm, 0.1 deg")

@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 from torch import nn
-from torch.utils.data import DataLoader
 
-from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
 from sigmaslam_training.devices import Workplace, loss_module, open_workplace, to_device
 from sigmaslam_training.features.checkpoint import (
@@ -31,6 +29,7 @@ from sigmaslam_training.features.validation import PAIRS, held_out_seed, held_ou
 from sigmaslam_training.interruption import Interruption
 from sigmaslam_training.journal import Journal
 from sigmaslam_training.run_card import CARD_NAME, describe_origin, make_card
+from sigmaslam_training.snapshot import save_tensors
 
 WEIGHTS_NAME = "features.safetensors"
 _LOG_EVERY = 50
@@ -81,8 +80,7 @@ def train(
             _Run(state, place, out, journal).finish(workers)
         card = make_card(state, place)
         if place.leads:
-            with atomic_path(out / WEIGHTS_NAME) as path:
-                save_file({name: value.cpu().contiguous() for name, value in state.network.state_dict().items()}, path)
+            save_tensors(out / WEIGHTS_NAME, state.network.state_dict())
             atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
     return card
 
@@ -132,39 +130,24 @@ class _Run:
                 raise TrainingStopped(self._saved, self._state.config.steps) from None
 
     def _steps(self, workers: int, interruption: Interruption) -> None:
-        state, config = self._state, self._state.config
+        state, config, place = self._state, self._state.config, self._place
         task = self._progress.add_task("training", total=config.steps, completed=state.step, note="")
         # The workers begin while this process validates.
-        batches = iter(self._loader(workers))
+        batches = iter(pair_loader(config, state.step, workers, place.rank, place.ranks, place.on_gpu))
         self._validate_if_due()
         for batch in batches:
             with interruption.whole_step():
-                loss = self._step(to_device(batch, self._place))
+                loss = self._step(to_device(batch, place))
             self._progress.update(task, completed=state.step)
             last = state.step == config.steps
             if state.step % _SHOW_EVERY == 0 or last:
-                self._progress.update(task, note=_note(loss))
+                note = " ".join(f"{name} {float(value.detach()):.3f}" for name, value in loss._asdict().items())
+                self._progress.update(task, note=note)
             if state.step % _LOG_EVERY == 0 or last:
                 self._log(loss)
             self._validate_if_due()
             if state.step % config.checkpoint_every == 0 or last:
                 self._save()
-
-    def _loader(self, workers: int) -> DataLoader[TrainingPair]:
-        config, place = self._state.config, self._place
-        return pair_loader(
-            config.mix,
-            config.seed,
-            config.size,
-            self._state.step * config.batch_size,
-            config.steps * config.batch_size,
-            config.points,
-            config.batch_size,
-            workers,
-            place.rank,
-            place.ranks,
-            pinned=place.on_gpu,
-        )
 
     def _step(self, batch: TrainingPair) -> PairLoss:
         """One step of the optimiser."""
@@ -217,7 +200,3 @@ class _Run:
             self._state.seconds = time.monotonic() - self._began
             save_checkpoint(self._checkpoint, self._state)
             self._saved = self._state.step
-
-
-def _note(loss: PairLoss) -> str:
-    return " ".join(f"{name} {float(value.detach()):.3f}" for name, value in loss._asdict().items())

@@ -14,6 +14,7 @@ from sigmaslam_synthetic.homography_pairs import HomographyPairs
 from sigmaslam_synthetic.rendering.textures import KINDS
 from sigmaslam_synthetic.scene_pairs import ScenePairs
 from sigmaslam_synthetic.worlds.own import SUFFIX
+from sigmaslam_training.features.recipes import TrainingConfig
 from sigmaslam_training.sources import WORLDS, Mix, label, turns_of
 
 # image0 (1, H, W), image1 (1, H, W), keypoints0 (N, 2), places1 (N, 2), visible (N,), keypoints1 (2 N, 2)
@@ -98,37 +99,33 @@ class MixedPairs:
 
 
 class PairDataset(Dataset[TrainingPair]):
-    """Pairs `first` to `last` of a mix, each with N random keypoints of image 0 and the 2 N strongest of image 1.
+    """The pairs of a run, each with N random keypoints of image 0 and the 2 N strongest of image 1.
 
     Args:
-        mix: as `sources.turns_of` takes it.
-        seed: of the stream.
-        size: side of the square images, pixels.
-        first, last: range of indices, so that a resumed run goes on where it stopped.
-        keypoints: N; random places fill up where an image has fewer, places far outside in image 1.
+        config: of the run, with N as `points`; random places fill up where an image has fewer, in image 1 places far
+            outside.
+        done: steps whose pairs are left out, so that a resumed run goes on where it stopped.
     """
 
-    def __init__(self, mix: Mix, seed: int, size: int, first: int, last: int, keypoints: int) -> None:
-        self._pairs = MixedPairs(mix, seed, size)
-        self._seed, self._size = seed, size
-        self._first, self._last = first, last
-        self._keypoints = keypoints
+    def __init__(self, config: TrainingConfig, done: int) -> None:
+        self._pairs = MixedPairs(config.mix, config.seed, config.size)
+        self._config, self._first = config, done * config.batch_size
 
     def __len__(self) -> int:
-        return self._last - self._first
+        return self._config.steps * self._config.batch_size - self._first
 
     def __getitem__(self, item: int) -> TrainingPair:
         if not 0 <= item < len(self):
             raise IndexError(item)
-        index = self._first + item
+        index, count = self._first + item, self._config.points
         pair = self._pairs.pair(index)
-        rng = np.random.default_rng((self._seed, 2, index))
+        rng = np.random.default_rng((self._config.seed, 2, index))
         # Choose keypoints of image 0 at random, to learn weak ones too, and keep all of image 1, to keep the partners.
-        keypoints0 = rng.permutation(self._strongest(pair.image0))[: self._keypoints]
-        filling = rng.uniform(0, self._size - 1, (self._keypoints - len(keypoints0), 2))
+        keypoints0 = rng.permutation(self._strongest(pair.image0))[:count]
+        filling = rng.uniform(0, self._config.size - 1, (count - len(keypoints0), 2))
         keypoints0 = np.concatenate([keypoints0, filling]).astype(np.float32)
         keypoints1 = self._strongest(pair.image1)
-        keypoints1 = np.pad(keypoints1, ((0, 2 * self._keypoints - len(keypoints1)), (0, 0)), constant_values=NOWHERE)
+        keypoints1 = np.pad(keypoints1, ((0, 2 * count - len(keypoints1)), (0, 0)), constant_values=NOWHERE)
         places1, visible = pair.transfer(keypoints0)
         return (
             torch.from_numpy(pair.image0)[None],
@@ -141,36 +138,26 @@ class PairDataset(Dataset[TrainingPair]):
 
     def _strongest(self, image: np.ndarray) -> np.ndarray:
         """At most 2 N keypoints, (K, 2) float32, the strongest first."""
-        keypoints, strength = detect(to_cells(torch.from_numpy(image)[None, None]), 2 * self._keypoints)
+        keypoints, strength = detect(to_cells(torch.from_numpy(image)[None, None]), 2 * self._config.points)
         return np.asarray(keypoints[strength > 0].numpy())
 
 
 def pair_loader(
-    mix: Mix,
-    seed: int,
-    size: int,
-    first: int,
-    last: int,
-    keypoints: int,
-    batch_size: int,
-    workers: int,
-    rank: int = 0,
-    ranks: int = 1,
-    pinned: bool = False,
+    config: TrainingConfig, done: int, workers: int, rank: int = 0, ranks: int = 1, pinned: bool = False
 ) -> DataLoader[TrainingPair]:
     """Batches of pairs in order of their index.
 
     Args:
-        mix, seed, size, first, last, keypoints: as `PairDataset` takes them; a batch begins at `first`.
-        batch_size: pairs of a batch, a multiple of `ranks`.
+        config: of the run; batches are of a multiple of `ranks` pairs.
+        done: steps whose batches are left out.
         workers: processes that make pairs.
         rank, ranks: this process takes pairs rank, rank + ranks, ... of every batch.
         pinned: batches lie where a GPU can fetch them.
     """
-    dataset = PairDataset(mix, seed, size, first, last, keypoints)
+    dataset = PairDataset(config, done)
     return DataLoader(
         Subset(dataset, range(rank, len(dataset), ranks)),
-        batch_size=batch_size // ranks,
+        batch_size=config.batch_size // ranks,
         num_workers=workers,
         worker_init_fn=prepare_worker if workers else None,
         # A fork of a process that has used OpenCV or torch may wait for ever for threads that it lacks.

@@ -1,6 +1,7 @@
 """What the verifier of places learns from: patches of rendered pairs found without features of the second image."""
 
 from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,11 +56,11 @@ def collect_place_rows(records: Iterable[PairRecord], seed: int, note: Callable[
                     np.roll(image1, [side // 2 for side in image1.shape], (0, 1)),
                     np.full_like(truth, np.inf),
                 )
-            pair = record.image0, image1
+            shown = _Shown((record.image0, image1), found, truth)
             if found.source == "stereo":
-                drawn = [_along_rows(pair, found, truth), _followed_along_rows(pair, found, truth, rng)]
+                drawn = [_along_rows(shown), _followed_along_rows(shown, rng)]
             else:
-                drawn = [_followed(pair, found, truth, rng)]
+                drawn = [_followed(shown, rng)]
             for columns, error in drawn:
                 if len(columns) >= _MIN_ROWS:
                     parts.append(VerifierRows(columns, error, np.full(len(columns), number)))
@@ -69,13 +70,17 @@ def collect_place_rows(records: Iterable[PairRecord], seed: int, note: Callable[
     return VerifierRows.concatenate(parts)
 
 
-_Pair = tuple[np.ndarray, np.ndarray]
+class _Shown(NamedTuple):
+    """Two images, keypoints of the first, and where they lie in the second (N, 2), infinite where not seen."""
+
+    pair: tuple[np.ndarray, np.ndarray]
+    found: MatchSet
+    truth: np.ndarray
 
 
-def _followed(
-    pair: _Pair, found: MatchSet, truth: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _followed(shown: _Shown, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Columns and errors of keypoints followed near a prediction."""
+    pair, found, _ = shown
     size = np.array(pair[1].shape[::-1])
     sigma = np.exp(rng.uniform(*np.log(_SIGMAS)))
     points = found.features0.keypoints.astype(np.float64)
@@ -86,7 +91,7 @@ def _followed(
     usable = np.flatnonzero(((predicted >= 0) & (predicted < size)).all(axis=1))
     points, predicted, expected = points[usable], predicted[usable], found.expected[usable]
     covariance = np.tile((sigma**2 + _OWN_SIGMA**2) * np.eye(2), (len(points), 1, 1))
-    start = _starts(pair, points, predicted, expected, found.visible[usable], rng)
+    start = _starts(shown, usable, predicted, rng)
     start[~within_ellipses(np.nan_to_num(start, nan=1e6) - predicted, covariance)] = np.nan
     A, _ = local_maps(points, expected, np.ones(len(points)))
     A = A @ (np.eye(2) + _MAP_ERROR * rng.standard_normal((len(points), 2, 2)))
@@ -94,81 +99,61 @@ def _followed(
     targets = PatchTargets(points, maps, predicted, covariance, start, correct_by_neighbours(predicted, start))
     small0, small1 = (shrink(image) for image in pair)
     places, there = find_patches(*pair, small0, small1, targets)
-    kept = usable[there]
-    return _describe(
-        pair, points[there], places[there], predicted[there], A[there], found, kept, truth, PlaceSearch.IN_TIME
-    )
+    search = PlaceSearch.IN_TIME
+    return _describe(shown, usable[there], points[there], places[there], predicted[there], search, A[there])
 
 
-def _starts(
-    pair: _Pair,
-    points: np.ndarray,
-    predicted: np.ndarray,
-    expected: np.ndarray,
-    visible: np.ndarray,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Where keypoints were followed to: by Lucas-Kanade over the whole way, or carried on from a frame before."""
+def _starts(shown: _Shown, rows: np.ndarray, predicted: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Where such keypoints were followed to: by Lucas-Kanade over the whole way, or carried on from a frame before."""
+    found = shown.found
     if rng.random() < 0.5:
-        places, found = follow_flow(*pair, points, predicted)
+        points = found.features0.keypoints[rows].astype(np.float64)
+        places, kept = follow_flow(*shown.pair, points, predicted)
     else:
-        noise = np.where(visible, _CARRIED, _DRIFT)[:, None] * rng.standard_normal(points.shape)
-        places, found = expected + noise, rng.random(len(points)) > _FORGOTTEN
-    return np.where(found[:, None], places, np.nan)
+        noise = np.where(found.visible[rows], _CARRIED, _DRIFT)[:, None] * rng.standard_normal(predicted.shape)
+        places, kept = found.expected[rows] + noise, rng.random(len(rows)) > _FORGOTTEN
+    return np.where(kept[:, None], places, np.nan)
 
 
-def _along_rows(pair: _Pair, found: MatchSet, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _along_rows(shown: _Shown) -> tuple[np.ndarray, np.ndarray]:
     """Columns and errors of keypoints searched for along the rows of a stereo pair."""
+    pair, found, _ = shown
     index, start = search_rows(*pair, found.features0.keypoints)
     points = found.features0.keypoints[index].astype(np.float64)
     places, there, slope = align_in_rows(*pair, points, start, REACH_SEARCHED)
     points = points[there]
-    return _describe(
-        pair, points, places[there], points, None, found, index[there], truth, PlaceSearch.ALONG_ROWS, slope[there]
-    )
+    search = PlaceSearch.ALONG_ROWS
+    return _describe(shown, index[there], points, places[there], points, search, slope=slope[there])
 
 
-def _followed_along_rows(
-    pair: _Pair, found: MatchSet, truth: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _followed_along_rows(shown: _Shown, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Columns and errors of keypoints whose disparity is predicted."""
+    pair, found, _ = shown
     points = found.features0.keypoints.astype(np.float64)
     low, high = np.log(_DISPARITY_SIGMAS)
     sigmas = np.exp(rng.uniform(low, high, 2))
     start = points.copy()
-    start[:, 0] = (
-        found.expected[:, 0] + sigmas[0] * rng.standard_normal() + sigmas[1] * rng.standard_normal(len(points))
-    )
+    shifted = found.expected[:, 0] + sigmas[0] * rng.standard_normal()
+    start[:, 0] = shifted + sigmas[1] * rng.standard_normal(len(points))
     usable = np.flatnonzero((start[:, 0] >= 0) & (start[:, 0] < pair[1].shape[1]))
     points, start = points[usable], start[usable]
     places, there, _ = align_in_rows(*pair, points, start, REACH_PREDICTED)
-    return _describe(
-        pair,
-        points[there],
-        places[there],
-        start[there],
-        None,
-        found,
-        usable[there],
-        truth,
-        PlaceSearch.PREDICTED_ALONG_ROWS,
-    )
+    search = PlaceSearch.PREDICTED_ALONG_ROWS
+    return _describe(shown, usable[there], points[there], places[there], start[there], search)
 
 
 def _describe(
-    pair: _Pair,
+    shown: _Shown,
+    index: np.ndarray,
     points: np.ndarray,
     places: np.ndarray,
     predicted: np.ndarray,
-    A: np.ndarray | None,
-    found: MatchSet,
-    index: np.ndarray,
-    truth: np.ndarray,
     search: PlaceSearch,
+    A: np.ndarray | None = None,
     slope: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and errors of places of the keypoints of that index."""
-    evidence = examine_patches(*pair, points, places, A)
-    sigma = found.features0.sigma[index]
+    """Columns and errors of places (M, 2) of keypoints with that index (M,)."""
+    evidence = examine_patches(*shown.pair, points, places, A)
+    sigma = shown.found.features0.sigma[index]
     columns = describe_places(*compare_with_neighbours(places, predicted, slope), evidence, sigma, search)
-    return columns, error_along_axes(evidence, places, truth[index])
+    return columns, error_along_axes(evidence, places, shown.truth[index])

@@ -29,7 +29,6 @@ def make_sample(match_set: MatchSet, rows: np.ndarray | None = None) -> Sample:
     """What the scorer sees of a set as the run time would show it, and the error of each match.
 
     Args:
-        match_set: the set.
         rows: only these of its matches.
     """
     rows = np.arange(len(match_set.places)) if rows is None else rows

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from rich.progress import Progress
-from safetensors.torch import save_file
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95
-from sigmaslam.files import atomic_path, atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
 from sigmaslam_evaluation.metrics import probability_calibration as calibration
 from sigmaslam_evaluation.metrics.probability_calibration import RIGHT
@@ -27,6 +26,7 @@ from sigmaslam_training.matching.place_rows import collect_place_rows
 from sigmaslam_training.matching.scorer_training import make_sample, score_set, train_scorer
 from sigmaslam_training.matching.verifier_training import VerifierRows, calibrate, collect_rows, train_verifier
 from sigmaslam_training.run_card import describe_origin
+from sigmaslam_training.snapshot import save_tensors
 
 SCORER_NAME, VERIFIER_NAME, CARD_NAME = "scorer.safetensors", "verifier.safetensors", "matching.json"
 PLACE_VERIFIER_NAME = "place_verifier.safetensors"
@@ -65,7 +65,6 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
 
     Args:
         out: run folder.
-        config: of the run.
         workers: processes that make pairs.
     Raises:
         InputError: the folder holds a run of another configuration, or something else.
@@ -102,7 +101,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
     networks = {"scorer": scorer, "verifier": verifier, "place_verifier": place_verifier}
     card = _make_card(origin, config, networks, metrics, clock.seconds())
     for name, network in zip((SCORER_NAME, VERIFIER_NAME, PLACE_VERIFIER_NAME), networks.values(), strict=True):
-        _save(out / name, network)
+        save_tensors(out / name, network.state_dict())
     atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
     return card
 
@@ -234,11 +233,6 @@ def _make_card(
         "limits": _LIMITS,
         "metrics_on_held_out_renders": {name: round(value, 4) for name, value in metrics.items()},
     }
-
-
-def _save(path: Path, module: torch.nn.Module) -> None:
-    with atomic_path(path) as temporary:
-        save_file({name: value.contiguous() for name, value in module.state_dict().items()}, temporary)
 
 
 def _open_bar(progress: Progress, title: str, steps: int) -> Callable[[int, str], None]:
