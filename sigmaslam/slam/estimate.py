@@ -75,12 +75,12 @@ class Estimate:
     covariance: np.ndarray
     matching_covariance: np.ndarray
     status: str
-    belief: float
-    matches: int
-    inliers: int
-    nis: float
-    dof: int
     calibration: CalibrationEstimate
+    belief: float = 0.0
+    matches: int = 0
+    inliers: int = 0
+    nis: float = 0.0
+    dof: int = 0
     milliseconds: dict[str, float] = field(default_factory=dict)
     frame_covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     by_calibration: np.ndarray = field(default_factory=lambda: np.zeros((6, CALIBRATION_SIZE)))

@@ -141,8 +141,7 @@ class Localiser:
         return matches, fit
 
     def _is_reachable(self, matches: GuidedMatches, fit: FrameFit, prediction: Prediction) -> bool:
-        """Whether the motion allows the pose, if in another moment, or most landmarks of earlier keyframes in view
-        confirm it.
+        """Whether the motion allows the pose, if in another moment, or most landmarks of earlier keyframes confirm it.
 
         Repeated texture of one keyframe agrees on wrong poses, hundreds of matches strong.
         """

@@ -95,10 +95,7 @@ class LoopCloser:
         return keyframe.timestamp
 
     def _revisited(self, newest: Keyframe) -> tuple[KnownKeyframe | None, float]:
-        """Of the keyframes that left the window long ago the one that looks most like the newest, or is nearest.
-
-        And by how much odometry may be off since, metres.
-        """
+        """The keyframe of long ago that looks most like the newest, or is nearest; metres of drift since."""
         state = published_state(self.window)  # where the rig is bad, the place is less certain
         pose, place = state.poses[-1], pose_slice(len(state) - 1)
         sigma = np.sqrt(np.trace(se3_body(pose, state.whole_covariance[place, place])[:3, :3]))

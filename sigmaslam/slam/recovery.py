@@ -81,10 +81,7 @@ class Recovery:
         return self._insert(NewKeyframe(view, timestamp, pose, self.motion.step, self.motion.step_covariance))
 
     def _waits(self, view: StereoView, timestamp: float) -> bool:
-        """Whether a blurred first view should give way to a sharper one, which an unsteady hand soon sees.
-
-        All poses are relative to it: its error stays in them.
-        """
+        """Whether a blurred first view, whose error would stay in all poses, should give way to a sharper one."""
         since = self.course.waiting_since = min(timestamp, self.course.waiting_since)
         return timestamp - since < self.config.lost_seconds and is_blurred(view.left)
 

@@ -15,6 +15,7 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse, turn_covariance
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
+from sigmaslam.slam.eye_timing import EyeTiming
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.inertial_estimate import describe_inertial
 from sigmaslam.slam.localisation import Prediction
@@ -32,12 +33,14 @@ class Reporter:
     Attributes:
         rectifier: of the images that are tracked.
         relative_poses: relates frames to keyframes.
+        timing: of the eyes.
     """
 
     rectifier: StereoRectifier
     window: KeyframeWindow
     motion: MotionFilter
     relative_poses: RelativePoseReporter
+    timing: EyeTiming
 
     def report(
         self,
@@ -73,7 +76,8 @@ class Reporter:
         T_left_rectified = se3_inverse(T_rectified_left)
         adjoint = se3_adjoint(T_left_rectified) @ se3_adjoint(se3_inverse(pose))
         belief = 1.0 - np.sqrt(max(np.linalg.eigvalsh(turn_covariance(se3_inverse(pose), relative))[-1], 0.0))
-        matching, by_error = adjoint @ absolute @ adjoint.T, adjoint @ by_error
+        drift = self.timing.drift * np.repeat([1.0, 1.0 / self.window.depth], 3)
+        matching, by_error = adjoint @ absolute @ adjoint.T + np.diag(drift**2), adjoint @ by_error
         covariance = matching + by_error @ by_error.T
         frame_covariance = adjoint @ relative @ adjoint.T if fit is not None else np.zeros((6, 6))
         covariance, matching = _within_half_turn(covariance), _within_half_turn(matching)
@@ -110,11 +114,6 @@ class Reporter:
             covariance=anywhere,
             matching_covariance=anywhere.copy(),
             status=status,
-            belief=0.0,
-            matches=0,
-            inliers=0,
-            nis=0.0,
-            dof=0,
             calibration=self._describe_calibration(published_state(self.window), None),
             milliseconds=milliseconds,
         )

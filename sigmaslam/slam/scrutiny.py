@@ -13,7 +13,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.prediction_errors import surprise, time_error
 from sigmaslam.geometry.se3 import se3_inverse, transform_points
 from sigmaslam.slam.doubt import Doubt, Doubts
-from sigmaslam.slam.eye_timing import EyeTiming
+from sigmaslam.slam.eye_timing import SPOILT, EyeTiming
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.frozen_images import shows_motion
 from sigmaslam.slam.guided_matching import GuidedMatches
@@ -25,8 +25,6 @@ from sigmaslam.two_view.stereo_pose import MIN_POINTS
 
 # So many bodies, or parts of one, are left out of an image one by one.
 _MOST_MOVERS = 3
-# Frames after one with landmarks that are fixed in the image: they have spoilt the map.
-_SPOILT = 20
 
 
 class Scrutiny:
@@ -36,6 +34,9 @@ class Scrutiny:
         localiser, clock: of the tracker.
         moving: where the scene moves on its own; None: all of it may.
         input_is_wrong: a check of the input found that the eyes do not fit.
+
+    Attributes:
+        timing: of the eyes.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class Scrutiny:
         self._T_rival_fit = np.eye(4)
         self._last_error, self._had_other_times = 0.0, False
         self._input_is_wrong = input_is_wrong
-        self._timing = EyeTiming()
+        self.timing = EyeTiming(self._window.camera.baseline)
         self._before: tuple[np.ndarray, ...] | None = None
         self._fixed_for = 0
 
@@ -80,7 +81,7 @@ class Scrutiny:
             doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
         seen = matches.views.select(fit.inliers)
         ids, follows = self._window.landmarks.id[seen.landmark], self._localiser.follower.is_ready
-        if self._timing.are_apart(frame, ids, seen.measurement, follows):
+        if self.timing.are_apart(frame, fit.pose, ids, seen.measurement, follows):
             doubts.add(Doubt.APART)
         elif self._is_fixed(left, matches, fit):
             doubts.add(Doubt.FIXED)
@@ -131,7 +132,7 @@ class Scrutiny:
             _, now, then = np.intersect1d(ids, old_ids, assume_unique=True, return_indices=True)
             stays = moves[now] & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
             is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves[now].sum()
-            self._fixed_for = _SPOILT if is_fixed else max(self._fixed_for - 1, 0)
+            self._fixed_for = SPOILT if is_fixed else max(self._fixed_for - 1, 0)
             self._before = left, fit.pose, ids, seen
         elif 2 * (ways > ACCEPTANCE.stands).sum() < len(ways) and shows_motion(image, left):
             return True

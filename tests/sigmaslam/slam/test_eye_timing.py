@@ -4,10 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.slam.eye_timing import EyeTiming
 from sigmaslam.slam.frame import Frame
 
 DISPARITY, FRAMES = 5, 40
+BASELINE, STEP = 0.5, np.array([0.1, 0.2, 0.2, 0.0, 0.0, 0.0])
 ROWS = np.random.default_rng(3).integers(-3, 4, FRAMES)
 """By which the texture is lower in each frame."""
 PLACES = np.stack(np.meshgrid(np.arange(30, 180, 15), np.arange(30, 140, 15)), axis=-1).reshape(-1, 2)
@@ -19,16 +21,19 @@ class Texture:
     observe = None
 
 
-def seen_apart(right_rows: np.ndarray, follows: bool = True, light: float = 1.0) -> list[bool]:
+def seen_apart(
+    right_rows: np.ndarray, follows: bool = True, timing: EyeTiming | None = None, light: float = 1.0
+) -> list[bool]:
     """What is said of each frame, whose right eye shows the texture by so many rows lower, from 10 on in that light."""
     noise = np.random.default_rng(2).normal(128.0, 120.0, (170, 210))  # as faint as sand
     texture = np.clip(cv2.GaussianBlur(noise, (0, 0), 3.0), 0, 255).astype(np.uint8)
-    timing, said = EyeTiming(), []
+    timing, said, pose = timing or EyeTiming(BASELINE), [], np.eye(4)
     for number, (left, right) in enumerate(zip(ROWS, right_rows, strict=True)):
         lit = np.uint8(light * texture) if number >= 10 else texture
         frame = Frame(np.roll(texture, left, 0), np.roll(lit, (right, -DISPARITY), (0, 1)), Texture)  # type: ignore[arg-type]
         seen = np.column_stack([PLACES + (0, left), np.full(len(PLACES), float(DISPARITY))])
-        said.append(timing.are_apart(frame, np.arange(len(PLACES)), seen, follows))
+        pose = pose @ se3_exp(STEP)
+        said.append(timing.are_apart(frame, pose, np.arange(len(PLACES)), seen, follows))
     return said
 
 
@@ -63,3 +68,14 @@ def test_eyes_that_agree_again_are_apart_as_long_as_the_map_is_spoilt():
     said = seen_apart(rows)
     assert all(said[9:31])
     assert not any(said[:5] + said[36:])
+
+
+def test_poses_drift_as_long_as_eyes_are_apart_and_keep_that():
+    rows, together, apart = ROWS.copy(), EyeTiming(BASELINE), EyeTiming(BASELINE)
+    rows[5:12] = ROWS[4:11]
+    seen_apart(ROWS, timing=together)
+    seen_apart(rows, timing=apart)
+    seen_apart(np.roll(ROWS, 1), timing=(always := EyeTiming(BASELINE)))
+    assert together.drift == 0.0
+    # Each step of 0.3 m goes on 0.1 m along the baseline, a fifth of it.
+    assert 7 * 0.3 * 0.2 < apart.drift < always.drift < FRAMES * 0.3
