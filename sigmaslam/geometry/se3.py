@@ -90,9 +90,12 @@ def rotation_exp(vectors: np.ndarray) -> np.ndarray:
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     """The rotation closest in the Frobenius norm to each matrix; (..., 3, 3) -> (..., 3, 3)."""
     u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
-    sign = np.ones((*u.shape[:-2], 3))
-    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
-    return np.asarray((u * sign[..., None, :]) @ vt)
+    nearest = np.asarray(u @ vt)
+    mirrored = np.linalg.det(nearest) < 0.0
+    if not mirrored.any():
+        return nearest
+    u[..., 2] = np.where(mirrored[..., None], -u[..., 2], u[..., 2])
+    return np.asarray(u @ vt)
 
 
 def rigid_motion(rotation: np.ndarray, translation: np.ndarray | Sequence[float]) -> np.ndarray:

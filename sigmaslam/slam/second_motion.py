@@ -162,4 +162,6 @@ def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) 
 
 def _among(chosen: np.ndarray, count: int) -> np.ndarray:
     """(count,) bool of indices."""
-    return np.isin(np.arange(count), chosen)
+    among = np.zeros(count, bool)
+    among[chosen] = True
+    return among
