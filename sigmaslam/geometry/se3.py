@@ -91,11 +91,10 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     """The rotation closest in the Frobenius norm to each matrix; (..., 3, 3) -> (..., 3, 3)."""
     u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
     nearest = np.asarray(u @ vt)
-    mirrored = np.linalg.det(nearest) < 0.0
-    if not mirrored.any():
-        return nearest
-    u[..., 2] = np.where(mirrored[..., None], -u[..., 2], u[..., 2])
-    return np.asarray(u @ vt)
+    if (mirrored := np.linalg.det(nearest) < 0.0).any():
+        u[..., 2] *= np.where(mirrored, -1.0, 1.0)[..., None]
+        nearest = np.asarray(u @ vt)
+    return nearest
 
 
 def rigid_motion(rotation: np.ndarray, translation: np.ndarray | Sequence[float]) -> np.ndarray:

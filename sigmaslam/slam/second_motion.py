@@ -162,6 +162,4 @@ def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) 
 
 def _among(chosen: np.ndarray, count: int) -> np.ndarray:
     """(count,) bool of indices."""
-    among = np.zeros(count, bool)
-    among[chosen] = True
-    return among
+    return np.bincount(chosen, minlength=count) > 0
