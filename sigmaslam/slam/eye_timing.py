@@ -59,8 +59,8 @@ class EyeTiming:
         differences = np.concatenate(self._rows, axis=1)
         enough, scatter = np.isfinite(differences).sum(axis=1) >= _FEWEST, np.full(3, np.inf)
         if enough[0]:
-            middle = np.nanmedian(differences[enough], axis=1, keepdims=True)
-            scatter[enough] = np.nanmedian(np.abs(differences[enough] - middle), axis=1)
+            middle = _medians(differences[enough])
+            scatter[enough] = _medians(np.abs(differences[enough] - middle[:, None]))
             same, late, early = scatter
             if ACCEPTANCE.other_moment * max(min(late, early), _PRECISE) < same:
                 self._apart_for = SPOILT
@@ -74,3 +74,9 @@ class EyeTiming:
         if self._apart_for:
             self.drift = self._next_drift
         return self._apart_for > 0
+
+
+def _medians(values: np.ndarray) -> np.ndarray:
+    """`np.nanmedian` to the bit of rows (K, N), none of them NaN alone; that takes ten times longer for a few rows."""
+    ranked, count, rows = np.sort(values, axis=1), np.isfinite(values).sum(axis=1), np.arange(len(values))
+    return np.asarray((ranked[rows, (count - 1) // 2] + ranked[rows, count // 2]) / 2.0)

@@ -164,4 +164,4 @@ def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) 
 
 def _among(chosen: np.ndarray, count: int) -> np.ndarray:
     """(count,) bool of indices."""
-    return np.isin(np.arange(count), chosen)
+    return np.bincount(chosen, minlength=count) > 0
