@@ -158,8 +158,7 @@ class FrameUpdate:
             # The frame's pose moves no landmark; a solution ends with another state.
             padded = np.pad(landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
             self._padded = state, landmarks.dependence, padded
-        is_seen = np.bincount(anchor := landmarks.anchor[rows]) > 0
-        anchors, pair = np.flatnonzero(is_seen), (np.cumsum(is_seen) - 1)[anchor]
+        anchors, pair = np.unique(landmarks.anchor[rows], return_inverse=True)
         is_compiled, dependence = window.graphs.is_compiled, self._padded[2]
         return {
             **window.graphs.constants(window.depth),

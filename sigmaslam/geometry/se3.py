@@ -90,11 +90,9 @@ def rotation_exp(vectors: np.ndarray) -> np.ndarray:
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     """The rotation closest in the Frobenius norm to each matrix; (..., 3, 3) -> (..., 3, 3)."""
     u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
-    nearest = np.asarray(u @ vt)
-    if (mirrored := np.linalg.det(nearest) < 0.0).any():
-        u[..., 2] *= np.where(mirrored, -1.0, 1.0)[..., None]
-        nearest = np.asarray(u @ vt)
-    return nearest
+    sign = np.ones((*u.shape[:-2], 3))
+    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * sign[..., None, :]) @ vt)
 
 
 def rigid_motion(rotation: np.ndarray, translation: np.ndarray | Sequence[float]) -> np.ndarray:
