@@ -16,6 +16,9 @@ from sigmaslam.geometry.se3 import nearest_rigid, se3_exp
 
 # An offset that is known to be so many standard deviations away is followed so far.
 _AGREES = 2.0
+# As of views (`_VIEW_TURN` in calibration_errors.py): no number of frames tells it from an offset.
+IN_COMMON = 0.01
+"""Standard deviation of an error of alignment with the right eye that all patches have in common, pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +45,8 @@ class HeldOffset:
     def place(
         self, pose: np.ndarray, estimate: float, covariance: np.ndarray, part: slice
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A pose as it is with this offset, and by what covariance (6, 6) it is off if the estimate is right.
+        """A pose as it is with this offset, and by what covariance (6, 6) it is off if the estimate is right, or as far
+        off as no images show.
 
         Args:
             pose: (4, 4) as estimated together with an offset.
@@ -52,5 +56,6 @@ class HeldOffset:
         """
         if self.value is None:
             return pose, np.zeros((6, 6))
-        step = step_with(covariance, part, 0, self.value - estimate)
-        return nearest_rigid(se3_exp(step) @ pose), np.outer(step, step)
+        by_pixel, change = step_with(covariance, part, 0, 1.0), self.value - estimate
+        spread = np.outer(by_pixel, by_pixel) * (change**2 + IN_COMMON**2)
+        return nearest_rigid(se3_exp(by_pixel * change) @ pose), spread

@@ -7,6 +7,7 @@ import numpy as np
 from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.held_offset import IN_COMMON
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.published_state import considered_growth, published_state
 from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
@@ -134,7 +135,7 @@ class Reporter:
         others = {ERRORS[k]: (float(errors[k]), float(sigma[k])) for k in chosen}
         focal = self.window.camera.fx
         shares = {k: (c.probability, c.mean / focal, float(np.sqrt(c.variance)) / focal) for k, c in causes.items()}
-        offset = float(errors[0]), float(sigma[0])
+        offset = float(errors[0]), float(np.hypot(sigma[0], IN_COMMON))
         return CalibrationEstimate(*offset, others, shares, self.window.worse, self.rectifier.raised)
 
 

@@ -35,7 +35,8 @@ def test_a_pose_for_another_offset_is_the_mean_given_that_offset():
     gain = covariance[:, :1] @ np.linalg.inv(covariance[:1, :1])
     given = (gain * 0.01)[1:, 0]
     np.testing.assert_allclose(se3_log(placed @ se3_inverse(pose)), given, rtol=1e-9)
-    np.testing.assert_allclose(spread, np.outer(given, given), rtol=1e-9)
+    # An alignment that errs alike everywhere by a hundredth of a pixel, as much as was moved, is no part of it.
+    np.testing.assert_allclose(spread, 2.0 * np.outer(given, given), rtol=1e-9)
 
 
 def test_nothing_is_held_before_a_second_keyframe():
