@@ -19,7 +19,7 @@ _ABOVE, _TALL, _BEFORE, _BROAD = 5, 11, 8, 16
 # The best place must have less than this share of the difference of the second best one.
 _MAX_RATIO = 0.9
 # Times the contrast of the other eye, from which on its light differs, and not what it sees.
-_EQUAL_LIGHT = 1.25
+_EQUAL_CONTRAST = 1.25
 # Disparities that count as neighbours of the best one, and by how many the way back may miss.
 _NEIGHBOURS, _MAX_MISS = 2, 1
 # Stands for no disparity: below all that are searched in images narrower than 8,000 pixels.
@@ -125,7 +125,7 @@ def _alike(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Derivatives (H, W) of two eyes as uint8 about 128; those of an eye with far less light are raised."""
     one, other = (max(float(cv2.meanStdDev(each)[1][0, 0]), 1.0) for each in (left, right))
     gain = other / one
-    raised = (max(gain, 1.0), max(1.0 / gain, 1.0)) if max(gain, 1.0 / gain) > _EQUAL_LIGHT else (1.0, 1.0)
+    raised = (max(gain, 1.0), max(1.0 / gain, 1.0)) if max(gain, 1.0 / gain) > _EQUAL_CONTRAST else (1.0, 1.0)
     first, second = (
         cv2.convertScaleAbs(each, alpha=0.5 * by, beta=128.0) for each, by in zip((left, right), raised, strict=True)
     )

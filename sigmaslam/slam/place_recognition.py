@@ -27,13 +27,11 @@ def retrieve(
     return [latest_first[k] for k in order[:count]]
 
 
-def most_alike(
-    view: StereoView, among: list[KnownKeyframe], appearance: AppearanceIndex, count: int = VOTING
-) -> list[KnownKeyframe]:
-    """The keyframes that look most like the view by one vector each, at most `count`, in their order."""
-    if len(among) <= count:
+def most_alike(view: StereoView, among: list[KnownKeyframe], appearance: AppearanceIndex) -> list[KnownKeyframe]:
+    """The keyframes that look most like the view by one vector each, at most `VOTING`, in their order."""
+    if len(among) <= VOTING:
         return among
-    alike = set(appearance.rank(view, count, {keyframe.id for keyframe in among}))
+    alike = set(appearance.rank(view, VOTING, {keyframe.id for keyframe in among}))
     return [keyframe for keyframe in among if keyframe.id in alike]
 
 
