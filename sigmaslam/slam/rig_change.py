@@ -9,7 +9,7 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.lucas_kanade import in_light_of, lucas_kanade
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_exp
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
@@ -51,7 +51,9 @@ def find_change(
         return None
     chosen, window = matches.views.select(fit.inliers), localiser.window
     offset = (0.0, 0.0, window.posterior.calibration[0])
-    way = localiser.motion.way(localiser.frame_clock.interval)
+    # An eye becomes late by an image that comes twice, without a pose: half of what surprises was there by then.
+    surprise = se3_log(fit.step @ se3_inverse(localiser.motion.step))
+    way = localiser.motion.way(localiser.frame_clock.interval) + 0.5 * surprise
     poses = fit.pose, *(fit.last @ se3_exp(moment) @ fit.step for moment in (-way, way))
     expected, *others = (seen_from(window, chosen.landmark, pose) + offset for pose in poses)
     expected[:, :2] = chosen.measurement[:, :2]
@@ -66,18 +68,17 @@ def find_change(
     shift, spread = np.nanmedian(moved, axis=0), _spread(moved, rays)
     if np.linalg.norm(shift) < ACCEPTANCE.bump or spread > ACCEPTANCE.bump:
         return None
-    # A late eye sees what is near move farther than the rest; a bump that is by chance the motion's moves all alike.
+    # A late eye sees what is near move farther; a bump moves all alike, also if that is by chance the motion's median.
+    # Twice as near to the other moment's places: where the camera stands both moments have the same.
     for other in others:
         apart = moved + places - RectifiedStereo.right_pixels(other)
-        left = np.linalg.norm(np.nanmedian(apart, axis=0))
-        if 2.0 * left < np.linalg.norm(shift) and _spread(apart, rays) < spread:
+        if 2.0 * np.linalg.norm(np.nanmedian(apart, axis=0)) < np.linalg.norm(shift) and _spread(apart, rays) < spread:
             return None
     return RigChange(fit, -float(shift[0]), float(shift[1]))
 
 
 def _spread(moved: np.ndarray, rays: np.ndarray) -> float:
-    """Standard deviation of ways (M, 2), pixels, by the better of a shift and a turn."""
-    # Of a camera that was turned what is at the border moves farther.
+    """Standard deviation of ways (M, 2), pixels, or of what a turn leaves of them, which moves the border farther."""
     ways = np.stack([moved, moved - (rays @ np.nanmedian(moved, axis=0))[:, None] * rays])
     away = np.abs(ways - np.nanmedian(ways, axis=1, keepdims=True))
     return float(_ROBUST * np.nanmedian(away, axis=1).max(axis=1).min())
