@@ -144,7 +144,9 @@ class LocationFilter:
             # The tracker's error is that of before the loss; the drift since then does not count.
             self._belief = self._belief_when_tracked
         self._reset_corrected_drift(estimate)
-        growth = self._drift_growth(estimate)
+        # Of the covariance of the tracker's drift, in the world, perturbed from the left.
+        values, vectors = np.linalg.eigh(_world_drift_covariance(estimate) - self._belief.drift_covariance)
+        growth = (vectors * np.maximum(values, 0.0)) @ vectors.T
         frame_covariance = turn_covariance(estimate.T_world_camera, _INDEPENDENT_SHARE * estimate.frame_covariance)
         self._renew_frame_error(frame_covariance)
         before, done = self._last, 0.0
@@ -172,11 +174,6 @@ class LocationFilter:
         return result
 
     # ---- the tracker's error
-
-    def _drift_growth(self, estimate: Estimate) -> np.ndarray:
-        """(6, 6) growth of the covariance of the tracker's drift, in the world, perturbed from the left."""
-        values, vectors = np.linalg.eigh(_world_drift_covariance(estimate) - self._belief.drift_covariance)
-        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def _renew_frame_error(self, frame_covariance: np.ndarray) -> None:
         """A new frame: its frame error, of covariance (6, 6), is independent of the one before."""

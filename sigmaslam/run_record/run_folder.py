@@ -69,7 +69,9 @@ class RunWriter:
         if not goes_on:
             check_new_folder(out)
         versions = describe_versions("sigmaslam", "numpy", "opencv-python-headless", "onnxruntime")
-        self.run = {**run, **_describe_start(), "versions": versions, "weights_sha256": _weight_hashes(run)}
+        hashes = {name: _sha256(shipped_weights(name)) for name in _GRAPHS}
+        hashes.update((run.get("weights") or {}).get("sha256", {}))
+        self.run = {**run, **_describe_start(), "versions": versions, "weights_sha256": hashes}
         self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -249,12 +251,6 @@ def _processor() -> str:
 def describe_versions(*packages: str) -> dict[str, str]:
     """Those of Python and of packages, for run.json."""
     return {"python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
-def _weight_hashes(run: dict[str, Any]) -> dict[str, str]:
-    """SHA-256 of every file that the run computes with."""
-    own = (run.get("weights") or {}).get("sha256", {})
-    return {**{name: _sha256(shipped_weights(name)) for name in _GRAPHS}, **own}
 
 
 def _sha256(path: Path) -> str:

@@ -49,7 +49,7 @@ from sigmaslam.slam.recovery import Recovery
 from sigmaslam.slam.relative_poses import RelativePoseReporter
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.reporting import Reporter
-from sigmaslam.slam.rig_change import RigChange, RigWatch
+from sigmaslam.slam.rig_change import RigChange, find_change
 from sigmaslam.slam.scrutiny import Scrutiny
 from sigmaslam.slam.set_clock import by_times
 from sigmaslam.slam.start_pose import StartPose
@@ -133,7 +133,6 @@ class StereoTracker:
         self._follower = follower = LandmarkFollower(guided)
         self._localiser = localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
         self._scrutiny = Scrutiny(localiser, self._clock, admission.moving, disparity_error is not None)
-        self._rig_watch = RigWatch(window, localiser, keyframes)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, motion, unguided, admission, config.min_inliers)
@@ -270,9 +269,11 @@ class StereoTracker:
             if self._beside is not None and self._mapper.keyframe_is_near:
                 frame.foresee(self._beside)
             matches, fit = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
-            change = None if fit is not None else self._rig_watch.find_change(frame, matches, prediction)
-            if fit is not None or change is not None:
-                return matches, fit, change
+            if fit is not None:
+                return matches, fit, None
+            change = find_change(self._localiser, self._keyframes.active[-1].view, frame, matches, prediction)
+            if change is not None:
+                return matches, None, change
             prediction = Prediction.of(self._window, self._motion)
         view = frame.view
         clock.lap("features")

@@ -18,7 +18,7 @@ from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks, Mapper
-from sigmaslam.slam.rig_change import RigChange
+from sigmaslam.slam.rig_change import RigChange, find_change
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.tracker import Estimate, StereoTracker
 from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, shift_image, spoil
@@ -161,7 +161,7 @@ def find_bump(demo: Demo, before: float, change: Callable[[np.ndarray], np.ndarr
     prediction = Prediction.of(tracker._window, tracker._motion)
     views = [each.view for each in tracker._keyframes.active]
     matches = tracker._localiser.guided.match_guided(frame.view, views, prediction.pose, prediction.covariance)
-    return tracker._rig_watch.find_change(frame, matches, prediction)
+    return find_change(tracker._localiser, views[-1], frame, matches, prediction)
 
 
 @pytest.mark.parametrize(("later", "change"), [(0.0, None), (-2.5, -2.5)])

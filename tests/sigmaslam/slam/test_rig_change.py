@@ -1,0 +1,40 @@
+"""In mid-run of the demo the right eye sees all landmarks elsewhere: it was bumped, or it is a frame late."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from sigmaslam.readers import StereoFrame
+from sigmaslam.slam.doubt import Doubt
+from sigmaslam.slam.tracker import StereoTracker
+from sigmaslam_benchmarks.live.driver_faults import shift_image, turn_image
+from tests.support.estimates import Demo, track
+
+AT = 12
+# Rows and columns by which the right eye sees the scene elsewhere than a frame before, in the median.
+MOTION = 1.4, 1.9
+
+
+def bumped_frames(demo: Demo, frames: list[StereoFrame]) -> list[int]:
+    """In which the rig is said to have changed."""
+    estimates = track(StereoTracker(demo[0], "klt", threads=1), frames)
+    return [k for k, each in enumerate(estimates) if Doubt.RIG in each.doubts]
+
+
+def test_an_eye_that_becomes_late_is_no_bump(demo: Demo):
+    frames = demo[1][: AT + 3]
+    late = [replace(frame, right=before.right) for before, frame in zip(frames[AT - 1 :], frames[AT:], strict=False)]
+    assert bumped_frames(demo, frames[:AT] + late) == []
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "degrees"),
+    [(3.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 0.3), (*MOTION, 0.0), (-MOTION[0], -MOTION[1], 0.0)],
+    ids=["rows", "columns", "turned", "as the scene moved", "against that"],
+)
+def test_a_bump_is_named_in_its_frame(demo: Demo, rows: float, columns: float, degrees: float):
+    frames = demo[1][: AT + 2]
+    bumped = [replace(each, right=turn_image(shift_image(each.right, rows, columns), degrees)) for each in frames[AT:]]
+    assert bumped_frames(demo, frames[:AT] + bumped) == [AT]
