@@ -130,8 +130,6 @@ class Mapper:
         self._last_count = fit.count
         share = fit.count / max(self._landmarks_in_keyframe, 1)
         if share >= self.config.keyframe_ratio:
-            if len(self.window) == self.config.window:
-                self.keyframes.active[0].prepare_to_leave()
             return None
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.

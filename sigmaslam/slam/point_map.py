@@ -17,6 +17,8 @@ from sigmaslam.table import Table
 
 # A keypoint may lie on either end of what its patch shows: standard deviation of its disparity, over that range.
 _EITHER_SURFACE = 0.5
+MIN_VIEWS = 3
+"""Landmarks that fewer have confirmed are not in the map."""
 # Points with less disparity are too far away for the map.
 _MIN_DISPARITY = 0.5
 
@@ -100,7 +102,7 @@ def most_confirmed(parts: list[PointMap], max_points: int) -> list[PointMap]:
     return [part.select(chosen) for part, chosen in zip(parts, np.split(kept, ends[:-1]), strict=True)]
 
 
-def window_points(window: KeyframeWindow, keyframe_times: np.ndarray, min_views: int = 3) -> PointMap:
+def window_points(window: KeyframeWindow, keyframe_times: np.ndarray, min_views: int = MIN_VIEWS) -> PointMap:
     """Landmarks of the window in the world.
 
     Of those that were seen often enough and have more than half a pixel of disparity.
@@ -113,7 +115,9 @@ def window_points(window: KeyframeWindow, keyframe_times: np.ndarray, min_views:
     return _triangulate(window, np.ones(len(window.landmarks), bool), keyframe_times, min_views, True)
 
 
-def anchor_points(window: KeyframeWindow, anchor: int, keyframe_times: np.ndarray, min_views: int = 3) -> PointMap:
+def anchor_points(
+    window: KeyframeWindow, anchor: int, keyframe_times: np.ndarray, min_views: int = MIN_VIEWS
+) -> PointMap:
     """The same of the landmarks of one anchor keyframe in its own frame, with covariances given its pose."""
     points = _triangulate(window, window.landmarks.anchor == anchor, keyframe_times, min_views, False)
     return points.transform(se3_inverse(window.posterior.poses[anchor]))
