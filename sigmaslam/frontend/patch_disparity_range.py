@@ -31,15 +31,15 @@ def semi_global(left: np.ndarray, right: np.ndarray, least: int, levels: int, **
         **settings: further ones of OpenCV's matcher.
     """
     # It gives none to columns that the whole range of disparities would leave.
-    wide = (cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in (left, right))
-    return _match(*wide, least, levels, **settings)[:, levels:]
+    wide = [cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
+    return _match(wide, least, levels, **settings)[:, levels:]
 
 
-def _match(left: np.ndarray, right: np.ndarray, least: int, levels: int, **settings: int) -> np.ndarray:
+def _match(pair: list[np.ndarray], least: int, levels: int, **settings: int) -> np.ndarray:
     """The same without the columns whose range of disparities leaves the images."""
     mode = cv2.STEREO_SGBM_MODE_SGBM_3WAY
     matcher = cv2.StereoSGBM.create(minDisparity=least, numDisparities=levels, speckleRange=1, mode=mode, **settings)
-    sixteenths = matcher.compute(left, right)
+    sixteenths = matcher.compute(*pair)
     return np.where(sixteenths >= 16 * least, sixteenths / np.float32(16.0), np.float32(np.nan))
 
 
@@ -66,7 +66,7 @@ def patch_disparity_range(left: np.ndarray, right: np.ndarray, measured: np.ndar
         columns = np.clip(column[:, None] + np.arange(-beside, beside + 1), 0, half.shape[1] - 1)
         windows.append(half[rows[:, :, None], columns[:, None, :]].reshape(-1, 2 * beside + 1))
     costs = {"blockSize": _BLOCK, "P1": _SMALL_STEP, "P2": _LARGE_STEP, "uniquenessRatio": _UNIQUE}
-    dense = _match(*windows, -_LEVELS // 2, _LEVELS, **costs).reshape(len(measured), 2 * reach + 1, -1)
+    dense = _match(windows, -_LEVELS // 2, _LEVELS, **costs).reshape(len(measured), 2 * reach + 1, -1)
     dv, du = np.mgrid[-_RADIUS : _RADIUS + 1, -_RADIUS : _RADIUS + 1]
     tilted = slope[:, 0, None, None] * du + slope[:, 1, None, None] * dv
     untilted = (dense[:, reach + dv, beside + du] - tilted).reshape(len(measured), -1)
