@@ -153,7 +153,9 @@ class PastPoses:
     def moved(self, step: np.ndarray, covariance: np.ndarray, cross: np.ndarray, common: np.ndarray) -> Self:
         """The poses moved by (6 K,), with other errors."""
         poses = nearest_rigid(se3_exp(step.reshape(-1, 6)) @ self.poses)
-        return type(self)(poses, 0.5 * (covariance + covariance.T), cross, common)
+        if covariance is not self.covariance:
+            covariance = 0.5 * (covariance + covariance.T)
+        return type(self)(poses, covariance, cross, common)
 
     def given(self, factor: np.ndarray, common: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Self:
         """Their posterior when something is learned about the window.

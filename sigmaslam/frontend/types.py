@@ -42,7 +42,7 @@ class StereoView:
             infinity; they have no disparity.
         small: the left image in smaller sizes, where the front-end needs them to follow its keypoints.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
-        is_blurred: motion has blurred the left image; of keyframes, not known of others.
+        is_blurred: motion has blurred the left image; of a frame, not known to the front-end.
     """
 
     left: np.ndarray

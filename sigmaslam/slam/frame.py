@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from concurrent.futures import Executor
+from dataclasses import replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.frontend import Frontend, StereoView
+from sigmaslam.frontend.motion_blur import is_blurred
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.argument_checks import check_mask
 from sigmaslam.slam.deferred import Deferred
@@ -37,7 +40,12 @@ class Frame:
         self.left = left
         self.right = right
         self.usable = usable
-        self._view = Deferred(lambda: frontend.observe(left, right).within(usable))
+        self._view = Deferred(lambda: replace(frontend.observe(left, right).within(usable), is_blurred=self.is_blurred))
+
+    @cached_property
+    def is_blurred(self) -> bool:
+        """Motion has blurred the left image."""
+        return is_blurred(self.left)
 
     @property
     def view(self) -> StereoView:

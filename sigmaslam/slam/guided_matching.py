@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from typing import Self
 
 import numpy as np
@@ -12,7 +11,7 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.mahalanobis import quantiles, squared_mahalanobis
 from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMatches
-from sigmaslam.frontend.motion_blur import is_blurred, streak_covariance
+from sigmaslam.frontend.motion_blur import streak_covariance
 from sigmaslam.frontend.plane_alignment import plane_maps
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.image_cells import pixels_in
@@ -99,7 +98,7 @@ class GuidedMatcher:
             if alone and anchor != reference % len(keyframes) and len(matches) < count:
                 continue  # a few that agree by chance would connect keyframes that hardly see each other
             parts.append((rows, search, matches))
-        return self._measured(parts, view.left, alone)
+        return self._measured(parts, view, alone)
 
     def follow(
         self,
@@ -138,7 +137,7 @@ class GuidedMatcher:
             (rows, search, matches.within(frame.usable))
             for (rows, search), matches in zip(searches, found, strict=True)
         ]
-        return self._measured(parts, frame.left, alone=False), excess
+        return self._measured(parts, frame, alone=False), excess
 
     def _searches(
         self,
@@ -178,21 +177,21 @@ class GuidedMatcher:
             yield anchor, rows[some], search
 
     def _measured(
-        self, parts: list[tuple[np.ndarray, KeypointSearch, TemporalMatches]], left: np.ndarray, alone: bool
+        self, parts: list[tuple[np.ndarray, KeypointSearch, TemporalMatches]], view: StereoView | Frame, alone: bool
     ) -> GuidedMatches:
         """Matches of keyframes, each with the rows that were searched for, as views of landmarks."""
         if not parts:
             return GuidedMatches.empty()
         matches = TemporalMatches.concatenate([found for _, _, found in parts])
         noise, common = self.noise.of_matches(matches), np.zeros((len(matches), 3, 2))
-        landmarks, streaked, end, is_view_blurred = [], False, 0, cache(lambda: is_blurred(left))
+        landmarks, streaked, end = [], False, 0
         for rows, search, found in parts:
             # Features of a keyframe ascend with the rows of its landmarks.
             landmarks.append(rows[np.searchsorted(search.index, found.key_index)])
             key, begin, end = search.key, end, end + len(found)
-            if not (key.is_blurred or is_view_blurred()):
+            if not (key.is_blurred or view.is_blurred):
                 continue
-            streak = streak_covariance(key.left, left, key.features.keypoints[found.key_index], found.points)
+            streak = streak_covariance(key.left, view.left, key.features.keypoints[found.key_index], found.points)
             if streak is not None:
                 # They share it: all of them say no more of it than one.
                 noise[begin:end, :2, :2] += len(found) * streak

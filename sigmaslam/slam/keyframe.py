@@ -9,9 +9,8 @@ from sigmaslam.estimation.landmark_table import LandmarkTable
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.patch_disparity_range import patch_disparity_range
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
-from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.packed_view import PackedView
-from sigmaslam.slam.point_map import PointMap
+from sigmaslam.slam.point_map import MIN_VIEWS, PointMap
 from sigmaslam.two_view.stereo_pose import RelativePose
 
 
@@ -26,7 +25,6 @@ class Keyframe:
         energies: (N, 2) of patches as of `patch_energies`, of the features that became landmarks; none once it has left
             the window.
         blur: of its image, as of `Keyframes.blur`.
-        dense: disparities as of `dense_disparity`, while it is in the window; None where there are none.
         points: landmarks that it was the anchor of, in its frame, once it has left the window.
         spread: (6, 6) by which its pose is less certain than its views say, perturbed from the left in the world.
     """
@@ -36,7 +34,6 @@ class Keyframe:
     view: StereoView
     energies: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     blur: float = 1.0
-    dense: Deferred[np.ndarray] | None = None
     points: PointMap = field(default_factory=PointMap.empty)
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -53,24 +50,19 @@ class Keyframe:
         """(N, D) of its features."""
         return self.view.features.descriptors
 
-    def prepare_to_leave(self) -> None:
-        """Makes what `measure_surfaces` needs, in a frame that has time for it."""
-        if self.dense is not None:
-            self.dense.get()
-
     def leave_window(self, points: PointMap) -> Self:
         """The keyframe as it is remembered, with the points (in its frame) that leave with it."""
         view = replace(self.view, right=np.zeros((0, 0), np.uint8), small=(), usable=None)
-        return replace(self, view=view, energies=np.zeros((0, 2)), dense=None, points=points)
+        return replace(self, view=view, energies=np.zeros((0, 2)), points=points)
 
     def measure_surfaces(self, landmarks: LandmarkTable, anchor: int) -> None:
-        """Notes in the table how much the surfaces around the landmarks of this keyframe vary; `anchor`: its number."""
-        if self.dense is None or self.view.slope is None:
+        """Notes how much surfaces vary around landmarks of this keyframe, number `anchor`, that are in the map."""
+        if self.view.slope is None:
             return
-        rows = landmarks.anchor == anchor
+        rows = (landmarks.anchor == anchor) & (landmarks.views >= MIN_VIEWS)
         index = landmarks.feature[rows]
-        measured, slope = self.view.measured(index), self.view.slope[index]
-        landmarks.disparity_range[rows] = patch_disparity_range(self.dense.get(), measured, slope)
+        patches = self.view.measured(index), self.view.slope[index]
+        landmarks.disparity_range[rows] = patch_disparity_range(self.view.left, self.view.right, *patches)
 
 
 @dataclass(frozen=True, slots=True)

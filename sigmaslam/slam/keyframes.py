@@ -1,6 +1,5 @@
 """The keyframes of the window, and those that left it."""
 
-from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,8 @@ from sigmaslam.estimation.marginalised_poses import step_between
 from sigmaslam.estimation.published_state import published_state
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import patch_energies
-from sigmaslam.frontend.patch_disparity_range import dense_disparity
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.appearance import AppearanceIndex
-from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.hanging_keyframes import hang_over
 from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe, KnownKeyframe
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
@@ -48,7 +45,6 @@ class Keyframes:
         max_keyframes: of those that left the window no more are known. Poses are remembered of the first sixty; the
             others hang at these.
         max_points: of the map; when there are twice as many, the least confirmed half goes.
-        executor: makes what only the map needs beside the tracking, if there is one.
 
     Attributes:
         active: keyframes of the window, in its order.
@@ -57,11 +53,8 @@ class Keyframes:
         appearance: of both, by their numbers.
     """
 
-    def __init__(
-        self, window: KeyframeWindow, max_keyframes: int, max_points: int, executor: Executor | None = None
-    ) -> None:
+    def __init__(self, window: KeyframeWindow, max_keyframes: int, max_points: int) -> None:
         self._window = window
-        self._executor = executor
         self._most_remembered = min(max(max_keyframes, 1), _REMEMBERED)
         self._max_points = max_points
         self._next_id = self._first_id = 0
@@ -93,10 +86,9 @@ class Keyframes:
         self, view: StereoView, timestamp: float, blur: float = 1.0, landmarks: np.ndarray | slice = slice(None)
     ) -> None:
         """Takes the newest keyframe of the window, with its blur and which of its features (K,) are landmarks."""
-        dense = Deferred(lambda: dense_disparity(view), self._executor)
         energies = np.zeros((len(view.features.keypoints), 2))
         energies[landmarks] = patch_energies(view.left, view.features.keypoints[landmarks])
-        self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, dense))
+        self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur))
         self._next_id += 1
 
     def blur(self, left: np.ndarray, seen: LandmarkViews) -> tuple[float, float]:

@@ -12,7 +12,6 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.feature_spacing import select_spaced
-from sigmaslam.frontend.motion_blur import is_blurred
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
@@ -130,13 +129,11 @@ class Mapper:
         self._last_count = fit.count
         share = fit.count / max(self._landmarks_in_keyframe, 1)
         if share >= self.config.keyframe_ratio:
-            if len(self.window) == self.config.window:
-                self.keyframes.active[0].prepare_to_leave()
             return None
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
         is_bad = doubts.spoils_keyframe or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
-        if share >= ACCEPTANCE.bad_keyframe_landmarks and (is_bad or is_blurred(frame.left)):
+        if share >= ACCEPTANCE.bad_keyframe_landmarks and (is_bad or frame.is_blurred):
             return None
         view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
@@ -186,7 +183,7 @@ class Mapper:
         window.add_views(views)
         index = self._add_landmarks(new.view, views, new.blur)
         slope = disparity_slopes(new.view.features.keypoints, new.view.disparity, index)
-        view = replace(new.view, slope=slope, is_blurred=is_blurred(new.view.left))
+        view = replace(new.view, slope=slope)
         keyframes.append(view, new.timestamp, new.blur, index)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()

@@ -17,10 +17,10 @@ from sigmaslam.table import Table
 
 # A keypoint may lie on either end of what its patch shows: standard deviation of its disparity, over that range.
 _EITHER_SURFACE = 0.5
+MIN_VIEWS = 3
+"""Landmarks that fewer have confirmed are not in the map."""
 # Points with less disparity are too far away for the map.
 _MIN_DISPARITY = 0.5
-# Two views do not show a wrong match.
-_MIN_VIEWS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def most_confirmed(parts: list[PointMap], max_points: int) -> list[PointMap]:
     return [part.select(chosen) for part, chosen in zip(parts, np.split(kept, ends[:-1]), strict=True)]
 
 
-def window_points(window: KeyframeWindow, keyframe_times: np.ndarray, min_views: int = _MIN_VIEWS) -> PointMap:
+def window_points(window: KeyframeWindow, keyframe_times: np.ndarray, min_views: int = MIN_VIEWS) -> PointMap:
     """Landmarks of the window in the world.
 
     Of those that were seen often enough and have more than half a pixel of disparity.
@@ -117,7 +117,7 @@ def window_points(window: KeyframeWindow, keyframe_times: np.ndarray, min_views:
 
 def anchor_points(window: KeyframeWindow, anchor: int, keyframe_times: np.ndarray) -> PointMap:
     """The same of the landmarks of one anchor keyframe in its own frame, with covariances given its pose."""
-    points = _triangulate(window, window.landmarks.anchor == anchor, keyframe_times, _MIN_VIEWS, False)
+    points = _triangulate(window, window.landmarks.anchor == anchor, keyframe_times, MIN_VIEWS, False)
     return points.transform(se3_inverse(window.posterior.poses[anchor]))
 
 

@@ -10,7 +10,6 @@ from sigmaslam.estimation.calibration_correction import change_rig
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
-from sigmaslam.frontend.motion_blur import is_blurred
 from sigmaslam.geometry.se3 import se3_body, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.keyframes import Keyframes
@@ -83,7 +82,7 @@ class Recovery:
     def _waits(self, view: StereoView, timestamp: float) -> bool:
         """Whether a blurred first view, whose error would stay in all poses, should give way to a sharper one."""
         since = self.course.waiting_since = min(timestamp, self.course.waiting_since)
-        return timestamp - since < self.config.lost_seconds and is_blurred(view.left)
+        return timestamp - since < self.config.lost_seconds and view.is_blurred
 
     def resume(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
         """Goes on from where a lost view was found."""

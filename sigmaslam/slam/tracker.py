@@ -125,7 +125,7 @@ class StereoTracker:
         self._motion = motion = build_motion(backend, imu, odometry, turned)
         self._course = course = Course()
         self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(), LastPairs()
-        self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points, self._beside)
+        self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
         self._frontend = frontend = loading.get()
         update = FrameUpdate(window, config.iterations, bool(motion.sensors))
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)

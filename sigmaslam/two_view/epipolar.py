@@ -88,15 +88,17 @@ def estimate_epipolar_pose(
     rays = MatchedRays(rays0, rays1, SIGMA0**2 * J @ J.T, J @ covariance.astype(np.float64) @ J.T)
     subset = agreeing[:: max(1, len(agreeing) // _SUBSET)]
     starts = [pose_of_essential(essential, rays0[subset], rays1[subset])]
-    starts += poses_of_plane(K, points0[subset], points1[subset], cv2.USAC_FAST, _SAMPLES, _PLANE_SHARE * len(subset))
+    least = _PLANE_SHARE * len(subset)
+    # A pose and the next one have opposite directions, and the same epipolar lines.
+    starts += poses_of_plane(K, points0[subset], points1[subset], cv2.USAC_FAST, _SAMPLES, least)[::2]
     best: EpipolarPose | None = None
     for start in starts:
         R, direction = _refine_pose(rays, probability, *start)
         near = (np.abs(rays.whitened(essential_matrix(R, direction))[0]) < _INLIER) & (probability >= MIN_PROBABILITY)
-        inliers = near & rays.in_front(R, direction)
-        pose = EpipolarPose(R, direction, inliers)
-        if best is None or pose.inliers.sum() > best.inliers.sum():
-            best = pose
+        for way in (direction, -direction):
+            inliers = near & rays.in_front(R, way)
+            if best is None or inliers.sum() > best.inliers.sum():
+                best = EpipolarPose(R, way, inliers)
     return best
 
 
@@ -146,6 +148,7 @@ def poses_of_plane(
     """Rotations and directions that a plane allows, if one homography explains so many of the matches; else none.
 
     Two poses explain the matches of a plane, and the 5-point method gives either. A homography may be that of a turn.
+    After each pose comes that of the opposite direction.
     """
     if len(points0) < MIN_MATCHES:
         return []

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.frontend.patch_disparity_range import dense_disparity, patch_disparity_range
-from sigmaslam.frontend.types import Features, StereoView
+from sigmaslam.frontend.patch_disparity_range import patch_disparity_range
 
 WIDTH, HEIGHT = 320, 160
 EDGE = 180  # columns before it are nearer, so that the left eye sees nothing that is hidden from the right one
@@ -29,32 +28,22 @@ def _keypoints(columns: list[float], disparity: np.ndarray) -> np.ndarray:
     return np.column_stack([places, disparity[places[:, 1].astype(int), places[:, 0].astype(int)]])
 
 
-def _dense(left: np.ndarray, right: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Of the pair with those (u, v, disparity) (K, 3)."""
-    count = len(measured)
-    features = Features(
-        measured[:, :2].astype(np.float32), np.zeros((count, 0), np.float32), np.ones(count), np.ones(count)
-    )
-    return dense_disparity(StereoView(left, right, features, measured[:, 2], np.ones(count)))
-
-
 def test_a_step_within_the_patch_is_seen_and_one_beyond_is_not() -> None:
     disparity = np.where(np.arange(WIDTH) < EDGE, FAR + STEP, FAR) * np.ones((HEIGHT, 1))
-    left, right = _pair(disparity)
+    pair = _pair(disparity)
     at = _keypoints([EDGE - 3.0, EDGE + 3.0], disparity)
     away = _keypoints([60.0, 120.0, 260.0], disparity)
-    dense = _dense(left, right, np.concatenate([at, away]))
-    assert np.median(patch_disparity_range(dense, at, np.zeros((len(at), 2)))) == pytest.approx(STEP, abs=1.5)
-    assert np.quantile(patch_disparity_range(dense, away, np.zeros((len(away), 2))), 0.9) < 0.1 * STEP
+    assert np.median(patch_disparity_range(*pair, at, np.zeros((len(at), 2)))) == pytest.approx(STEP, abs=1.5)
+    assert np.quantile(patch_disparity_range(*pair, away, np.zeros((len(away), 2))), 0.9) < 0.1 * STEP
 
 
 def test_the_slope_of_the_surface_is_no_relief() -> None:
     slope = np.array([0.0, 0.2])
     disparity = FAR + slope[1] * np.arange(HEIGHT)[:, None] * np.ones(WIDTH)
     points = _keypoints([100.0, 160.0, 220.0], disparity)
-    dense = _dense(*_pair(disparity), points)
-    level = np.median(patch_disparity_range(dense, points, np.zeros((len(points), 2))))
-    tilted = np.median(patch_disparity_range(dense, points, np.tile(slope, (len(points), 1))))
+    pair = _pair(disparity)
+    level = np.median(patch_disparity_range(*pair, points, np.zeros((len(points), 2))))
+    tilted = np.median(patch_disparity_range(*pair, points, np.tile(slope, (len(points), 1))))
     assert level == pytest.approx(12 * slope[1], abs=1.0)
     assert tilted < 0.5 * level
 
@@ -62,6 +51,5 @@ def test_the_slope_of_the_surface_is_no_relief() -> None:
 def test_images_without_texture_say_nothing() -> None:
     blank = np.zeros((HEIGHT, WIDTH), np.uint8)
     points = _keypoints([100.0], np.full((HEIGHT, WIDTH), FAR))
-    dense = _dense(blank, blank, points)
-    assert (patch_disparity_range(dense, points, np.zeros((len(points), 2))) == 0.0).all()
-    assert len(patch_disparity_range(dense, points[:0], np.zeros((0, 2)))) == 0
+    assert (patch_disparity_range(blank, blank, points, np.zeros((len(points), 2))) == 0.0).all()
+    assert len(patch_disparity_range(blank, blank, points[:0], np.zeros((0, 2)))) == 0
