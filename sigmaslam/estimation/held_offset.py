@@ -45,8 +45,7 @@ class HeldOffset:
     def place(
         self, pose: np.ndarray, estimate: float, covariance: np.ndarray, part: slice
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A pose as it is with this offset, and by what covariance (6, 6) it is off if the estimate is right, or as far
-        off as no images show.
+        """A pose as it is with this offset, and the covariance (6, 6) of what other offsets would make of it.
 
         Args:
             pose: (4, 4) as estimated together with an offset.

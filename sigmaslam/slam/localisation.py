@@ -135,9 +135,11 @@ class Localiser:
             other_matches, other = self._localise_anywhere(view, keyframes, prediction, matches, clock)
             if fit is None or (other is not None and self._is_better(other, fit)):
                 matches, fit = other_matches, other
-        min_inliers = ACCEPTANCE.doubtful_inliers * self.config.min_inliers
-        if fit is not None and fit.nis_before_scaling > ACCEPTANCE.noise_nis and fit.count < min_inliers:
-            return matches, None  # chance agreement of a few
+        if fit is not None and fit.count < ACCEPTANCE.doubtful_inliers * self.config.min_inliers:
+            # Chance agreement of a few: in noise, or on repeated texture, where most do not agree.
+            most = fit.count >= ACCEPTANCE.guided_share * len(matches.probability)
+            if fit.nis_before_scaling > (ACCEPTANCE.noise_nis if most else ACCEPTANCE.doubtful_nis):
+                return matches, None
         return matches, fit
 
     def _is_reachable(self, matches: GuidedMatches, fit: FrameFit, prediction: Prediction) -> bool:
