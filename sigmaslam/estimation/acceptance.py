@@ -15,8 +15,8 @@ class Acceptance:
         guided_share: of the matches near a prediction; fewer agree where the prediction has become a mover's.
         unguided_share: of the matches near a pose without a prediction; fewer suffice, it was told from movers before.
         doubtful_nis: NIS per degree of freedom; a fit above it may sit in a wrong place.
-        noise_nis: likewise, half of what chance agreement in pure noise has.
-        doubtful_inliers: times the least inliers above that; so large a noise excuses chance agreement of a few.
+        noise_nis: likewise where half of the matches agree: half of what chance agreement in pure noise has.
+        doubtful_inliers: times the least inliers above these; so large a noise excuses chance agreement of a few.
         left_over: share of the landmarks of the last frame; what covers the view leaves more from frame to frame.
         last_keyframes: number compared without a prediction; one of them may be blurred or covered.
         unguided_margin: share of the scene's depth, and radians, that an unguided pose is off by beyond its covariance.
