@@ -62,16 +62,23 @@ class FrameClock:
 
     Attributes:
         late: seconds by which the last interval is longer than usual, if the clock may have been set in it, or 0.
+        was_blind: the frame before showed nothing; to be set by who sees it.
     """
 
     def __init__(self) -> None:
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
         self._is_believed, self._seconds, self.late = True, 0.0, 0.0
+        self.was_blind = False
 
     @property
     def interval(self) -> float:
         """Mean of the last ones, seconds; 0 before the first."""
         return float(np.mean(self._intervals)) if self._intervals else 0.0
+
+    @property
+    def after_gap(self) -> bool:
+        """Nothing was seen for longer than usual."""
+        return self.late > 0.0 or self.was_blind
 
     @property
     def is_slow(self) -> bool:

@@ -41,6 +41,7 @@ class GuidedMatches:
         searched: (S,) rows of those that were searched for.
         streaked: motion has blurred either the view or one of the keyframes.
         rival: (4, 4) another pose that nearly as many matches agree with; None: there is none.
+        after_gap: the keyframes are far behind, but views to come will be near this one.
     """
 
     views: LandmarkViews
@@ -48,6 +49,7 @@ class GuidedMatches:
     searched: np.ndarray
     streaked: bool = False
     rival: np.ndarray | None = None
+    after_gap: bool = False
 
     @classmethod
     def empty(cls) -> Self:

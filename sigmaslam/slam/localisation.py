@@ -1,6 +1,6 @@
 """The pose of a frame in the window: near the prediction first, then anywhere."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -222,7 +222,7 @@ class Localiser:
                 clock.lap("filter")
             enough = fit is not None and fit.count >= ACCEPTANCE.unguided_share * len(matches.probability)
             if fit is not None and enough and self._is_reachable(matches, fit, prediction):
-                return matches, fit
+                return replace(matches, after_gap=self.frame_clock.after_gap), fit
         return matches, None
 
     def _fit_alone(

@@ -139,8 +139,12 @@ class Mapper:
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
-        # With what neighbours share counted here, too, the truth is missed by more where the calibration is off.
-        views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / fit.clustering)
+        # With what neighbours share counted here, too, the truth is missed by more where the calibration is off. After
+        # a gap they err alike in this view and in all to come: what they share counts, and they are asked no more.
+        shared = 1.0 if matches.after_gap else fit.clustering
+        views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / shared)
+        if matches.after_gap:
+            self.window.landmarks.misses[:] = self.config.max_misses
         step, covariance = expected
         if self.motion.is_inertial:
             # Its velocity is that of the images, and off alike in all steps of a window: together they know one way.

@@ -60,10 +60,10 @@ class Relocaliser:
         """Finds the view and moves all keyframes of the window to the past; None, and no change, if it is nowhere.
 
         Args:
-            after_gap: the last keyframe is asked, too. Without one, its landmarks are lost because the rig has changed.
+            after_gap: in time, or in what images show: the last keyframe is asked, too. Without one, its landmarks are
+                lost because the rig has changed.
         """
-        min_points = self.admission.min_points
-        if not view.has_stereo(min_points, self.min_inliers):
+        if not self.is_enough(view):
             return None
         # Features of the last one may be many where none of its landmarks is found again.
         last = self.keyframes.active[-1:] if after_gap else []
@@ -81,10 +81,14 @@ class Relocaliser:
             if (trusts_motion and excludes) or (is_last and not is_clear):
                 continue
             admitted = view.only(self.admission.admit(view, pose, self.window))
-            if not admitted.has_stereo(min_points, self.min_inliers):
+            if not self.is_enough(admitted):
                 continue
             while self.keyframes.active:
                 self.keyframes.marginalise_oldest(spare=keyframe)
             covariance = from_origin(keyframe, relative).covariance
             return Relocalisation(admitted, pose, covariance, self.keyframes.index(keyframe.origin))
         return None
+
+    def is_enough(self, view: StereoView) -> bool:
+        """Whether a view has enough in stereo to be a keyframe."""
+        return view.has_stereo(self.admission.min_points, self.min_inliers)

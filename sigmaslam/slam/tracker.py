@@ -222,7 +222,7 @@ class StereoTracker:
             frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable)
             tracks = self._recovery.go_on_after_bump(change, frame.view, timestamp)
             status = "lost" if tracks is None else doubts.status
-        elif (found := self._relocaliser.relocalise(frame.view, self._clock.late > 0.0)) is not None:
+        elif (found := self._relocaliser.relocalise(frame.view, self._clock.after_gap)) is not None:
             status = "relocalised"
             tracks = self._recovery.resume(found, timestamp)
         else:
@@ -233,6 +233,8 @@ class StereoTracker:
         frame.finish()
         loop = self._loops.close() if tracks is not None else None
         clock.lap("map")
+        # The images before it again, or too little in stereo.
+        self._clock.was_blind = is_repeated or (fit is None and not self._relocaliser.is_enough(frame.view))
         self._course.timestamp = timestamp
         estimate = self._reporter.report(timestamp, status, matches, fit, tracks, loop, clock.milliseconds, doubts)
         self._history.append(estimate, predicted, filtered)
