@@ -15,6 +15,7 @@ from sigmaslam.two_view.epipolar import (
     EpipolarPose,
     MatchedRays,
     log_gain,
+    most_in_front,
     neighbours_factor,
     pose_of_essential,
     poses_of_plane,
@@ -151,9 +152,10 @@ def _starts(
     if np.shape(E) != (3, 3):
         return []
     agreeing = mask.ravel() > 0
-    starts = [pose_of_essential(E, rays.rays0[agreeing], rays.rays1[agreeing])]
+    seen = rays.rays0[agreeing], rays.rays1[agreeing]
     least = _PLANE_SHARE * float(agreeing.sum())
-    return starts + poses_of_plane(K, points0, points1, cv2.USAC_ACCURATE, _PLANE_SAMPLES, least)
+    plane = poses_of_plane(K, points0, points1, cv2.USAC_ACCURATE, _PLANE_SAMPLES, least)
+    return [pose_of_essential(E, *seen), *(most_in_front([pose], *seen) for pose in plane)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,6 +330,8 @@ def _turn_alone(rays: MatchedRays, best: _Fit) -> tuple[np.ndarray, np.ndarray] 
 
 def _on_plane(rays: MatchedRays, probability: np.ndarray, fit: _Fit) -> _Fit | None:
     """The fit by both coordinates of the inliers if they are on one plane within their errors, else None."""
+    if fit.inliers.sum() < MIN_MATCHES:
+        return None
     R, direction, squared, known = _fit_places(rays.chosen(fit.inliers), fit.R, fit.direction, slice(0, 8))
     flat = squared < _GATE**2
     scale = float(squared[flat].sum()) / max(2 * int(flat.sum()) - 8, 1)
