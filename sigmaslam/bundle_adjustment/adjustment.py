@@ -97,7 +97,6 @@ def adjust(
     quantile and weights the others by their covariances. The last one also estimates the offset.
 
     Args:
-        tracks: the observations.
         poses: (N, 4, 4) T_world_camera of all frames, as tracked.
         covariances: (N, 6, 6) of the poses; only their growth over gaps in the tracks is used.
         tell: receives messages on the progress.

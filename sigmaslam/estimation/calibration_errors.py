@@ -135,7 +135,6 @@ def measured_errors(camera: RectifiedStereo, uvd: np.ndarray) -> np.ndarray:
     """(M, 3, 15) by how much each error, of size one, changes what is measured of points, to first order.
 
     Args:
-        camera: as calibrated.
         uvd: (M, 3) (u, v, disparity).
     """
     u, v, disparity = uvd.T

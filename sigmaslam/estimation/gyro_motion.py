@@ -13,7 +13,6 @@ class GyroMotion(OdometryMotion):
 
     Args:
         backend: "onnx" or "torch".
-        sensor: its clock.
         T_camera_imu: (4, 4) takes points of the sensor into the camera that is tracked.
     """
 

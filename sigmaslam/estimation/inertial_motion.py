@@ -43,7 +43,6 @@ class InertialMotion(MotionFilter):
 
     Args:
         backend: "onnx" or "torch".
-        sensor: its noise and clock.
         T_camera_imu: (4, 4) takes points of the sensor into the camera that is tracked.
         wheels: measure the velocity besides.
     """

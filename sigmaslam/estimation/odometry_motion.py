@@ -40,7 +40,6 @@ class OdometryMotion(MotionFilter):
 
     Args:
         backend: "onnx" or "torch".
-        sensor: its clock.
         T_camera_base: (4, 4) takes points of the vehicle's frame into the camera that is tracked.
     """
 

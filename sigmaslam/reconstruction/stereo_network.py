@@ -18,7 +18,6 @@ class StereoNetwork:
 
     Args:
         path: .onnx file.
-        threads: within one operator.
     Raises:
         InputError: the file is missing, or no such graph.
     """

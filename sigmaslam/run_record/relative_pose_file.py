@@ -50,7 +50,6 @@ def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
     """The relative poses that a run has left in its folder so far.
 
     Args:
-        folder: of the run.
         timestamps: (N,) of the frames with a pose, seconds, as they were tracked.
     """
     columns = read_rows(folder / PARTIAL_RELATIVE_POSES, (), (), (), (4, 4), (6, 6))
@@ -65,8 +64,6 @@ def write_partial_frame_pairs(folder: Path, pairs: FramePairs, timestamps: np.nd
     """Writes relative poses as a run leaves them, so that it can go on.
 
     Args:
-        folder: of the run.
-        pairs: what `collect_frame_pairs` returns.
         timestamps: (N,) of the frames with a pose, seconds.
     """
     span = np.array([SPANS.index(span) for span in pairs.span], np.int64)

@@ -11,7 +11,6 @@ class Deferred(Generic[T]):
     """A value that is made once, by whoever needs it first; the same wherever it is made.
 
     Args:
-        make: gives the value.
         executor: begins at once to make it beside what goes on, if there is one.
     """
 

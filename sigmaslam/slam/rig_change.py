@@ -43,7 +43,6 @@ def find_change(
     Args:
         before: the last keyframe's.
         matches: landmarks that were followed to it, with disparities that may be wrong.
-        prediction: of its pose.
     """
     matches = replace(matches, views=replace(matches.views, measurement=matches.views.measurement * (1, 1, np.nan)))
     fit = localiser.fit_near(matches, prediction)
