@@ -63,11 +63,7 @@ class RowFit:
         return float(np.median(np.linalg.norm(self.by_lag, axis=1)))
 
     def agreement(self, tolerance: float) -> float:
-        """Share of the matches that a parallel pair with these errors has: rows agree, disparities are positive.
-
-        Args:
-            tolerance: of the rows, pixels; of disparities half of it.
-        """
+        """Share that a parallel pair with these errors has: rows within `tolerance` px, disparity above -0.5 of it."""
         return float(((np.abs(self.residual) <= tolerance) & (self.disparity > -0.5 * tolerance)).mean())
 
 

@@ -85,15 +85,7 @@ def estimate_relative_orientation(
     Sampson's error, first with Geman and McClure's loss, then with one that is that of least squares up to three
     standard deviations. A match whose rays meet behind the cameras is moved to infinity, and costs what that takes.
     The covariance is that of the mixture of all poses found (Laplace's approximation of each), times what clusters of
-    errors add.
-
-    Args:
-        K: (3, 3) intrinsics of both images.
-        points0, points1: (M, 2) pixels.
-        probability: (M,) of the matches.
-        covariance: (M, 2, 2) of points1, pixels squared.
-    Returns:
-        The pose; None with fewer than 8 probable matches, or if the 5-point method fails.
+    errors add. Arguments, and None for a pose, are as of `estimate_epipolar_pose`.
     """
     probable = np.flatnonzero(probability >= MIN_PROBABILITY)
     if len(probable) < MIN_MATCHES:
