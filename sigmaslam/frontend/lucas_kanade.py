@@ -9,6 +9,8 @@ from sigmaslam.frontend.types import Refinement
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 # Side of a patch, pixels, that of the flow that gives starts: larger ones straddle depths, smaller ones slide on edges.
 _WINDOW = 15
+# Likewise, of matches that are refined: they are within pixels of their places.
+_REFINED = 11
 # Above the image itself: in the smallest one half a patch is 112 pixels, as much as most disparities. The way back
 # starts from where it should end.
 _LEVELS = 4, 1
@@ -77,18 +79,13 @@ def follow_both_ways(
 
 
 def refine(
-    image0: np.ndarray,
-    image1: np.ndarray,
-    points0: np.ndarray,
-    points1: np.ndarray,
-    window: int = 11,
-    reach: float = 2.0,
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, reach: float = 2.0
 ) -> Refinement:
     """Matched points moved to where the patches agree, if that is near.
 
     Where the solver went further than `reach` pixels or failed they stay.
     """
     start = points1.astype(np.float64)
-    places, found = lucas_kanade(image0, image1, points0, points1, window, 0)
+    places, found = lucas_kanade(image0, image1, points0, points1, _REFINED, 0)
     moved = found & (np.linalg.norm(places - start, axis=1) <= reach)
     return Refinement(start, np.where(moved[:, None], places, start), moved)
