@@ -211,8 +211,8 @@ def _count_pairs(estimate_path: Path, source: Path, estimate: Trajectory, truth:
     paired, _ = associate(estimate, truth, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
     if len(paired) < _FEWEST_PAIRS:
         raise InputError(
-            f"{source}: one of its {len(truth)} poses alone is of the time of a pose of {estimate_path}; two are needed. "
-            "Is it the truth of this run, and are both in the same clock?"
+            f"{source}: one of its {len(truth)} poses alone is of the time of a pose of {estimate_path}; two are "
+            "needed. Is it the truth of this run, and are both in the same clock?"
         )
     if association == "time at 10 Hz" and len(paired) < len(estimate):
         raise InputError(
