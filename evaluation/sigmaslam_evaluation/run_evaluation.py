@@ -95,19 +95,8 @@ def evaluate_run(
         if (run_or_trajectory / FRAMES_NAME).is_file():
             frames = read_frames(run_or_trajectory / FRAMES_NAME)
     estimate, true, association = _same_clock(estimate_path, truth, frames)
-    paired, _ = associate(estimate, true, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
-    if len(paired) < _FEWEST_PAIRS:
-        raise InputError(
-            f"{truth}: one of its {len(true)} poses alone is of the time of a pose of {estimate_path}; two are needed. "
-            "Is it the truth of this run, and are both in the same clock?"
-        )
-    if association == "time at 10 Hz" and len(paired) < len(estimate):
-        raise InputError(
-            f"{truth}: a KITTI file without times.txt beside it is taken as 10 Hz, but only "
-            f"{len(paired)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
-            "times.txt of the images beside the pose file"
-        )
-    unpaired = _describe_unpaired(estimate, true, len(paired))
+    pairs = _count_pairs(estimate_path, truth, estimate, true, association)
+    unpaired = _describe_unpaired(estimate, true, pairs)
     follows_object = is_run and _follows_object(run_or_trajectory)
     convention, has_quaternions = truth_convention or TruthConvention(), trajectory_format(truth) == "tum"
     if convention.quaternion != "xyzw" and not has_quaternions:
@@ -215,6 +204,23 @@ def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None
     if frames is not None and len(frames) == len(truth):
         return estimate, Trajectory(frames.columns["timestamp"], truth.poses), "index"
     return estimate, truth, "time at 10 Hz"
+
+
+def _count_pairs(estimate_path: Path, source: Path, estimate: Trajectory, truth: Trajectory, association: str) -> int:
+    """Poses of one time in both; InputError where they are too few."""
+    paired, _ = associate(estimate, truth, 1e-3 if association == "time at 10 Hz" else MAX_DIFFERENCE)
+    if len(paired) < _FEWEST_PAIRS:
+        raise InputError(
+            f"{source}: one of its {len(truth)} poses alone is of the time of a pose of {estimate_path}; two are "
+            "needed. Is it the truth of this run, and are both in the same clock?"
+        )
+    if association == "time at 10 Hz" and len(paired) < len(estimate):
+        raise InputError(
+            f"{source}: a KITTI file without times.txt beside it is taken as 10 Hz, but only "
+            f"{len(paired)} of the {len(estimate)} poses of {estimate_path} have such times: put the "
+            "times.txt of the images beside the pose file"
+        )
+    return len(paired)
 
 
 def _describe_unpaired(estimate: Trajectory, truth: Trajectory, pairs: int) -> str | None:

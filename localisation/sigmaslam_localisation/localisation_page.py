@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from sigmaslam.files import atomic_write_text, printable
 from sigmaslam.plot_style import BLUE, GREEN, GREY, NO_MATPLOTLIB, SERIES, has_matplotlib, style_axes
 from sigmaslam.report.figures import save_png
+from sigmaslam.report.page_parts import load_template
 from sigmaslam_localisation.robots import RobotEstimate
 
 if TYPE_CHECKING:
@@ -35,13 +35,8 @@ def write_page(
         summaries: by robot, label and value.
         figures: title, caption and figure of each.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sigmaslam_localisation", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-    )
     labels = list(dict.fromkeys(label for summary in summaries.values() for label in summary))
-    text = environment.get_template("localisation.html").render(
+    text = load_template("localisation.html", "sigmaslam_localisation").render(
         name=printable(name),
         columns=list(summaries),
         rows=[

@@ -97,7 +97,6 @@ def adjust(
     quantile and weights the others by their covariances. The last one also estimates the offset.
 
     Args:
-        tracks: the observations.
         poses: (N, 4, 4) T_world_camera of all frames, as tracked.
         covariances: (N, 6, 6) of the poses; only their growth over gaps in the tracks is used.
         tell: receives messages on the progress.
@@ -113,53 +112,28 @@ def adjust(
     offset = float(tracks.disparity_offset[0])
     rectified = turn_covariance(se3_inverse(T_left_rectified), covariances[frames])
     solver = Solver(observations, tracked, rectified, tell)
+    selection = _Selection(observations, seen_again(observations, np.ones(len(observations), bool)), config, tell)
 
-    repeated = seen_again(observations, np.ones(len(observations), bool))
-
-    def fit(kept: np.ndarray, at: np.ndarray, offset: float) -> tuple[Structure, np.ndarray]:
-        """Points at fixed poses, and which repeated observations are of far landmarks.
-
-        Landmarks without a kept observation use all of theirs.
-        """
-        tell("points by themselves")
-        unused = np.bincount(observations.landmark[kept], minlength=len(observations.host)) == 0
-        structure = fit_structure(observations, kept | (repeated & unused[observations.landmark]), at, offset)
-        return structure, repeated & ~(structure.significance >= min_significance)[observations.landmark]
-
-    min_significance = config.min_significance
-    structure, far = fit(repeated, tracked, offset)
-    kept = choose(observations, repeated, structure, tracked, offset, min_significance, gated=False)
+    repeated = selection.repeated
+    structure, far = selection.fit(repeated, tracked, offset)
+    kept = choose(observations, repeated, structure, tracked, offset, config.min_significance, gated=False)
     if not kept.any():
         raise InputError(
             f"none of {len(structure.points)} landmarks is seen by two keyframes and near enough to have a depth: "
             "there is nothing to adjust"
         )
     solution = solver.solve(kept, tracked, structure.points, offset, robust=True)
-
-    def select_inliers() -> tuple[np.ndarray, Structure]:
-        """Inliers of the solution among all repeated observations, and points that fit it."""
-        structure, far = fit(kept, solution.poses, offset)
-        inliers = choose(observations, repeated, structure, solution.poses, offset, min_significance, gated=True)
-        near = int((repeated & ~far).sum())
-        if inliers.sum() < max(_MIN_SHARE * near, 1):
-            raise InputError(
-                f"{inliers.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
-                "tracks of the same run?"
-            )
-        return inliers, structure
-
-    kept, structure = select_inliers()
+    kept, structure = selection.inliers(kept, solution.poses, offset)
     solution = solver.solve(kept, solution.poses, structure.points, offset)
-    kept, structure = select_inliers()
+    kept, structure = selection.inliers(kept, solution.poses, offset)
     while True:
         solution, curvature, by_offset = solver.solve_with_offset(
             kept, solution.poses, structure.points, solution.offset, config.offset_sigma
         )
         # Reject landmarks that have moved to infinity. The limit is halved, or those near it would come and go.
-        structure, far = fit(kept, solution.poses, solution.offset)
-        near = choose(
-            observations, kept, structure, solution.poses, solution.offset, 0.5 * min_significance, gated=False
-        )
+        structure, far = selection.fit(kept, solution.poses, solution.offset)
+        limit = 0.5 * config.min_significance
+        near = choose(observations, kept, structure, solution.poses, solution.offset, limit, gated=False)
         if np.array_equal(near, kept):
             break
         kept = near
@@ -194,6 +168,40 @@ def adjust(
         solves=solver.solves,
         converged=solver.converged,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Selection:
+    """Chooses among the `repeated` observations (O,) bool, those of landmarks that two keyframes or more see."""
+
+    observations: Observations
+    repeated: np.ndarray
+    config: RefineConfig
+    tell: Callable[[str], None]
+
+    def fit(self, kept: np.ndarray, poses: np.ndarray, offset: float) -> tuple[Structure, np.ndarray]:
+        """Points at fixed poses, and which repeated observations (O,) are of far landmarks.
+
+        Landmarks without a kept observation use all of theirs.
+        """
+        self.tell("points by themselves")
+        landmark = self.observations.landmark
+        unused = np.bincount(landmark[kept], minlength=len(self.observations.host)) == 0
+        structure = fit_structure(self.observations, kept | (self.repeated & unused[landmark]), poses, offset)
+        return structure, self.repeated & ~(structure.significance >= self.config.min_significance)[landmark]
+
+    def inliers(self, kept: np.ndarray, poses: np.ndarray, offset: float) -> tuple[np.ndarray, Structure]:
+        """Inliers (O,) of a solution, and points that fit it."""
+        structure, far = self.fit(kept, poses, offset)
+        limit = self.config.min_significance
+        inliers = choose(self.observations, self.repeated, structure, poses, offset, limit, gated=True)
+        near = int((self.repeated & ~far).sum())
+        if inliers.sum() < max(_MIN_SHARE * near, 1):
+            raise InputError(
+                f"{inliers.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
+                "tracks of the same run?"
+            )
+        return inliers, structure
 
 
 def _sum_of_squares(

@@ -114,10 +114,7 @@ def point_covariances(
 def fit_structure(observations: Observations, kept: np.ndarray, poses: np.ndarray, offset: float) -> Structure:
     """Each landmark by Gauss-Newton with Huber's loss, as (u, v, disparity) in its host, where infinity is regular.
 
-    Args:
-        observations: O of them.
-        kept: (O,) bool, the observations to use.
-        poses, offset: as for `whitened_residuals`.
+    Arguments are those of `point_covariances` and `whitened_residuals`.
     """
     fx, fy, _, _, baseline = observations.intrinsics
     focal_baseline = fx * baseline

@@ -41,7 +41,6 @@ class ArrowSystem:
     """The normal equations of factors.
 
     Args:
-        factors: all of them.
         count: number N of states.
         size: n unknowns of each.
         shared: b unknowns of all.

@@ -102,7 +102,6 @@ def solve_bundle(rig: Rig, poses: np.ndarray, corners: Corners, weights: np.ndar
     Args:
         rig: start.
         poses: (n, 4, 4) T_left_board to start from, of images 0 to n - 1, each of which has corners.
-        corners: what is seen.
         weights: (n,) how often each image counts; once by default.
 
     Raises:

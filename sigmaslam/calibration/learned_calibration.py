@@ -18,8 +18,6 @@ def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, foca
     is not known.
 
     Args:
-        camera: as calibrated.
-        learned: what the images say.
         focal_length: of the rectified pair, pixels.
     """
     shares = {name: value for name, (_, value, _) in learned.causes.items()}

@@ -19,7 +19,6 @@ def write_rectified(sequence: StereoSequence, out: Path, done: Callable[[], obje
     """Write `left/` and `right/` PNG images, `times.txt` and `calibration.yaml`, which `track` reads.
 
     Args:
-        sequence: what to rectify.
         out: folder, new or empty.
         done: called after each pair.
 

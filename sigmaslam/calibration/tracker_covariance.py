@@ -25,7 +25,6 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
     disparity offset is one of them in the fit, but not in the result, as the tracker estimates it.
 
     Args:
-        rig: the calibrated pair.
         covariance: (P, P) of `rig.names`.
 
     Returns:

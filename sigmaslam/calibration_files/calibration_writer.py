@@ -17,7 +17,6 @@ def write_calibration(path: Path, camera: StereoCamera, more: dict[str, Any] | N
     """Write what `StereoCamera.from_yaml` reads back exactly; sigmas only where they are not the defaults.
 
     Args:
-        path: of the YAML file.
         more: further entries, which `from_yaml` leaves alone.
 
     Raises:

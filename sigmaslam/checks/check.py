@@ -56,7 +56,6 @@ def check_sequence(
     Args:
         sequence: opened by `sigmaslam.readers.open_sequence` or `open_cameras`, and not yet read.
         samples: pairs to look at.
-        threads: of ONNX Runtime.
         track_imu: where there is an inertial sensor, also track some seconds and judge it by how the cameras move.
     Raises:
         InputError: a file cannot be read.

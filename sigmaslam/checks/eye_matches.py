@@ -59,12 +59,7 @@ class EyeMatches(Table):
 
 
 class EyeMatcher:
-    """Matches the eyes of pairs with the shipped features.
-
-    Args:
-        rectifier: of the calibration that is to be checked.
-        threads: of ONNX Runtime.
-    """
+    """Matches the eyes of pairs with the shipped features."""
 
     def __init__(self, rectifier: StereoRectifier, threads: int = 2) -> None:
         self.rectifier = rectifier

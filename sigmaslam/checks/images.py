@@ -25,11 +25,7 @@ EYES = ("left", "right")
 
 
 def check_images(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Finding]:
-    """Findings from images as they are stored.
-
-    Args:
-        pairs: left and right (H, W) uint8 images.
-    """
+    """Findings from pairs of images, left and right (H, W) uint8, as they are stored."""
     return [_check_exposure(pairs), _check_sharpness(pairs), _check_lines(pairs), _check_same(pairs)]
 
 

@@ -25,7 +25,6 @@ def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | N
     """The worst that is wrong with a sensor's table; turns are judged while tracking, by those of the images.
 
     Args:
-        recording: the table.
         timestamps: of the images, seconds; None where they are not known.
     """
     samples, source = recording.samples, recording.source

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sigmaslam.checks.eye_matches import EyeMatches
+from sigmaslam.estimation.gaussian import robust_sigma
 from sigmaslam.geometry.camera import RectifiedStereo
 
 _ITERATIONS = 20
@@ -62,11 +63,7 @@ class RowFit:
         return float(np.median(np.linalg.norm(self.by_lag, axis=1)))
 
     def agreement(self, tolerance: float) -> float:
-        """Share of the matches that a parallel pair with these errors has: rows agree, disparities are positive.
-
-        Args:
-            tolerance: of the rows, pixels; of disparities half of it.
-        """
+        """Share that a parallel pair with these errors has: rows within `tolerance` px, disparity above -0.5 of it."""
         return float(((np.abs(self.residual) <= tolerance) & (self.disparity > -0.5 * tolerance)).mean())
 
 
@@ -111,7 +108,7 @@ def _fit(columns: np.ndarray, values: np.ndarray, probability: np.ndarray) -> tu
     damping = 1e-9 * np.eye(len(coefficients))
     for _ in range(_ITERATIONS):
         residual = values - columns @ coefficients
-        sigma = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SIGMA)
+        sigma = max(float(robust_sigma(residual)), _MIN_SIGMA)
         weighted = columns * (probability / (1.0 + (residual / (_ROBUST * sigma)) ** 2) ** 2)[:, None]
         normal = weighted.T @ columns
         normal += damping * np.trace(normal)

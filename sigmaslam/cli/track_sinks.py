@@ -38,7 +38,6 @@ def open_sinks(options: LiveOptions, out: Path, camera: StereoCamera) -> Iterato
     Args:
         options: stream, video, viewer, web page and dense cloud.
         out: folder of the run.
-        camera: of its images.
     Raises:
         InputError: a name is wrong.
         typer.Exit: the run is whole, but nobody reads the stream any more.

@@ -132,12 +132,7 @@ class CalibrationPrior:
 
 
 def measured_errors(camera: RectifiedStereo, uvd: np.ndarray) -> np.ndarray:
-    """(M, 3, 15) by how much each error, of size one, changes what is measured of points, to first order.
-
-    Args:
-        camera: as calibrated.
-        uvd: (M, 3) (u, v, disparity).
-    """
+    """(M, 3, 15) by how much each error, of size one, changes (u, v, disparity) (M, 3), to first order."""
     u, v, disparity = uvd.T
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     x_right = x - disparity / camera.fx

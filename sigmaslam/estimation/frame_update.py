@@ -67,7 +67,6 @@ class FrameUpdate:
         """Posterior of a frame's pose.
 
         Args:
-            views: what it sees.
             pose, step_covariance: as of `predict`: the prior.
             min_inliers: fewer are no pose.
             start: (4, 4) pose to linearise at first, close to the truth; then the innovations are not gated against

@@ -2,6 +2,14 @@
 
 import numpy as np
 
+# Standard deviation of a normal distribution over the median of its absolute values.
+_SIGMA_PER_MEDIAN = 1.4826
+
+
+def robust_sigma(residual: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Standard deviation of residuals about zero, of which less than half may be wrong; NaN is left out."""
+    return np.asarray(_SIGMA_PER_MEDIAN * np.nanmedian(np.abs(residual), axis=axis))
+
 
 def matrix_root(covariance: np.ndarray) -> np.ndarray:
     """A with A A^T = covariance, which may be singular."""

@@ -12,8 +12,6 @@ class GyroMotion(OdometryMotion):
     """Odometry that measures angular velocities alone, whose slow error is the gyro's bias.
 
     Args:
-        backend: "onnx" or "torch".
-        sensor: its clock.
         T_camera_imu: (4, 4) takes points of the sensor into the camera that is tracked.
     """
 

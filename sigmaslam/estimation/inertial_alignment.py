@@ -171,9 +171,6 @@ class GravitySearch:
 
     Attributes:
         poses: T_first_camera (4, 4) with their times.
-
-    Args:
-        sensor_sigma: as of `align`.
     """
 
     def __init__(self, sensor_sigma: np.ndarray) -> None:

@@ -18,9 +18,6 @@ class InertialBuffer(SampleBuffer):
     """Integrates samples of angular rate and specific force between images.
 
     Of these, `factors` (2, 3, 3) are taken off, errors of scale and misalignment.
-
-    Args:
-        sensor: its noise and clock.
     """
 
     def __init__(self, sensor: InertialSensor) -> None:

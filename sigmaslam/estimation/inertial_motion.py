@@ -42,8 +42,6 @@ class InertialMotion(MotionFilter):
     fall aside by 17 mm in a second, one that is 0.5 % wrong by 35 mm once it has turned round.
 
     Args:
-        backend: "onnx" or "torch".
-        sensor: its noise and clock.
         T_camera_imu: (4, 4) takes points of the sensor into the camera that is tracked.
         wheels: measure the velocity besides.
     """

@@ -39,8 +39,6 @@ class OdometryMotion(MotionFilter):
     learned from how far poses lie from predictions. What no column measures is zero: wheels neither slide nor jump.
 
     Args:
-        backend: "onnx" or "torch".
-        sensor: its clock.
         T_camera_base: (4, 4) takes points of the vehicle's frame into the camera that is tracked.
     """
 

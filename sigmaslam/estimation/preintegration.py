@@ -73,9 +73,7 @@ def preintegrate(
 
     Args:
         samples: at least one; those around the interval, too.
-        start, end: of the interval.
         gyro_bias, accel_bias: (3,) taken off.
-        sensor: its noise.
         densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
     """
     t = samples.timestamp

@@ -36,7 +36,6 @@ def frame_relative_to(state: WindowState, frame: FramePosterior, index: np.ndarr
 
     Args:
         state: of the window that the frame has been fitted to.
-        frame: its fit.
         index: as of `last_relative_to`.
     Returns:
         (M, 4, 4) T_world_earlier, and (M, 6, 6) covariance of the frame's pose relative to each, perturbed from the

@@ -12,11 +12,7 @@ _KEPT = 20.0
 
 
 class SampleBuffer:
-    """Takes samples of two vectors as they come.
-
-    Args:
-        time_shift: clock of the sensor minus that of the camera, seconds.
-    """
+    """Takes samples of two vectors as they come, by a clock that is `time_shift` seconds ahead of the camera's."""
 
     def __init__(self, time_shift: float) -> None:
         self.time_shift = time_shift

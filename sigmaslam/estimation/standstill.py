@@ -28,9 +28,6 @@ class Standstill:
     Attributes:
         speed_variance: (3, 3) of the velocity that images cannot tell from zero, in the camera's frame, (m/s)^2.
         spectra: (6,) of gyro and accelerometer at rest, as of white noise.
-
-    Args:
-        sensor: its noise.
     """
 
     def __init__(self, sensor: InertialSensor) -> None:

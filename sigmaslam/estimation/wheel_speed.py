@@ -23,7 +23,6 @@ class WheelSpeed:
     """Compares wheels with images, and measures the velocity of the vehicle as well as they have agreed lately.
 
     Args:
-        sensor: its clock.
         T_camera_base: (4, 4) takes points of the vehicle's frame into the camera that is tracked.
     """
 

@@ -57,7 +57,8 @@ class KltFrontend:
 def _match(search: KeypointSearch, start: np.ndarray, left: np.ndarray, right: np.ndarray) -> TemporalMatches:
     """Corners of a keyframe in a pair, from a start (K, 2)."""
     points = search.key.features.keypoints[search.index]
-    places, tracked = follow_both_ways(search.key.left, left, points, start)
+    height, width = left.shape
+    places, tracked = follow_both_ways(search.key.left, left, points, np.clip(start, 0, (width - 1, height - 1)))
     if search.covariance is not None:
         tracked &= within_ellipses(places - search.predicted, search.covariance)
     places = places[tracked]

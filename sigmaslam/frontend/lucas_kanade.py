@@ -9,8 +9,11 @@ from sigmaslam.frontend.types import Refinement
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 # Side of a patch, pixels, that of the flow that gives starts: larger ones straddle depths, smaller ones slide on edges.
 _WINDOW = 15
-# Above the image itself: in the smallest one half a patch is 112 pixels, as much as most disparities.
-_LEVELS = 4
+# Likewise, of matches that are refined: they are within pixels of their places.
+_REFINED = 11
+# Above the image itself: in the smallest one half a patch is 112 pixels, as much as most disparities. The way back
+# starts from where it should end.
+_LEVELS = 4, 1
 # Pixels that the way back may miss by: more keeps corners that slid along an edge, less loses those on slopes.
 _FORWARD_BACKWARD = 0.7
 # Shares of the contrast by which light may differ: eyes that both see well are compared as they are.
@@ -58,29 +61,31 @@ def in_light_of(image0: np.ndarray, image1: np.ndarray) -> np.ndarray:
 
 
 def follow_both_ways(
-    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, guess1: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N, 2) in image 1 from guesses (N, 2), and whether (N,) tracking back from them returns to the start."""
-    height, width = image1.shape
-    guess1 = np.clip(guess1, 0, (width - 1, height - 1))
-    places, converged = lucas_kanade(image0, image1, points0, guess1, _WINDOW, _LEVELS)
-    back, returned = lucas_kanade(image1, image0, places, points0, _WINDOW, 1)
-    return places, converged & returned & (np.linalg.norm(back - points0, axis=1) <= _FORWARD_BACKWARD)
-
-
-def refine(
     image0: np.ndarray,
     image1: np.ndarray,
     points0: np.ndarray,
-    points1: np.ndarray,
-    window: int = 11,
-    reach: float = 2.0,
+    guess1: np.ndarray,
+    window: int = _WINDOW,
+    levels: tuple[int, int] = _LEVELS,
+    tolerance: float = _FORWARD_BACKWARD,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 2) in image 1 from guesses (N, 2), and whether (N,) the way back ends within `tolerance` pixels.
+
+    `levels` are those of the way there and of the way back.
+    """
+    places, converged = lucas_kanade(image0, image1, points0, guess1, window, levels[0])
+    back, returned = lucas_kanade(image1, image0, places, points0, window, levels[1])
+    return places, converged & returned & (np.linalg.norm(back - points0, axis=1) <= tolerance)
+
+
+def refine(
+    image0: np.ndarray, image1: np.ndarray, points0: np.ndarray, points1: np.ndarray, reach: float = 2.0
 ) -> Refinement:
     """Matched points moved to where the patches agree, if that is near.
 
     Where the solver went further than `reach` pixels or failed they stay.
     """
     start = points1.astype(np.float64)
-    places, found = lucas_kanade(image0, image1, points0, points1, window, 0)
+    places, found = lucas_kanade(image0, image1, points0, points1, _REFINED, 0)
     moved = found & (np.linalg.norm(places - start, axis=1) <= reach)
     return Refinement(start, np.where(moved[:, None], places, start), moved)

@@ -399,14 +399,7 @@ class RectifiedStereo:
         return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels of points, the inverse of `triangulate`.
-
-        Args:
-            points: (..., 3) in the left camera frame, metres; Z must be positive (not checked).
-
-        Returns:
-            (..., 3) (u_left, v, disparity), pixels.
-        """
+        """(u_left, v, disparity) (..., 3), pixels, of points (..., 3) in the left camera, metres; Z > 0: unchecked."""
         points = np.asarray(points)
         X, Y, Z = points[..., 0], points[..., 1], points[..., 2]
         u, v = self.fx * X / Z + self.cx, self.fy * Y / Z + self.cy

@@ -90,11 +90,7 @@ def estimate_noise(image: np.ndarray) -> NoiseModel:
 
 
 def quantiser_step(image: np.ndarray) -> float:
-    """Grey levels between the levels of a coarse quantiser of 1 to 7 bits; 0 where there is none.
-
-    Args:
-        image: (H, W) uint8, or float, which is never coarse.
-    """
+    """Grey levels between those of a coarse quantiser of 1 to 7 bits, in (H, W) uint8; 0 without, as in float."""
     if image.dtype != np.uint8:
         return 0.0
     used = np.flatnonzero(np.bincount(image.ravel(), minlength=256))

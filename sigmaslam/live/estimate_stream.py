@@ -142,7 +142,6 @@ class UdpStream:
     """A datagram a frame, whether anyone receives it or not.
 
     Args:
-        host, port: of the receiver.
 
     Attributes:
         name: for messages.

@@ -20,7 +20,6 @@ class VideoSink:
     """Writes a picture a frame; the file appears when it is whole.
 
     Args:
-        path: of the .mp4.
         camera: of the raw images.
 
     Attributes:

@@ -42,7 +42,6 @@ class WebPageSink:
     Args:
         address: `PORT` of this machine alone, `HOST:PORT` or `[::1]:PORT`; port 0 takes a free one.
         camera: of the raw images.
-        judge: of the calibration.
 
     Attributes:
         name: for messages.

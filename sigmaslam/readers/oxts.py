@@ -66,10 +66,7 @@ def read_packets(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def estimate_densities(seconds: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """White noise of gyro and accelerometer per root hertz, with the vibrations that packets are too few for.
 
-    By second differences of successive samples, in which slow motion cancels.
-
-    Args:
-        seconds, values: as `read_packets` returns them.
+    By second differences of successive samples, as of `read_packets`, in which slow motion cancels.
     """
     if len(seconds) < 3:
         return 0.0, 0.0

@@ -224,7 +224,6 @@ def read_times(
     """Timestamps of a times file: seconds, or KITTI raw's dates, one a line.
 
     Args:
-        path: text file.
         count: number of pairs.
         numbers: frame numbers of the pairs; a file of a whole recording is then indexed by them.
         whole: which of all frames are pairs, (N,) bool; a file may have a line for each.

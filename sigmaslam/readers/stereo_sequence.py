@@ -175,12 +175,9 @@ class StereoSequence:
             raise InputError(f"{self.source}: not one of {len(self.skipped)} pairs can be read")
 
     def sample(self, count: int) -> list[FrameStep]:
-        """Frames to judge the sequence by, each with the one after it; those that cannot be read are left out.
+        """At most `count` frames to judge the sequence by, each with the one after it; unreadable ones are left out.
 
         Of image files they are spread over the whole recording, of a video or bag over its first frames.
-
-        Args:
-            count: how many, at most.
         """
         pairs = self._pairs
         if isinstance(pairs, ImagePairs):

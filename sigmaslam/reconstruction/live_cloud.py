@@ -34,9 +34,7 @@ class CloudSink:
     A few views and a bounded number of voxels are in memory; a pose far from the one before it begins anew.
 
     Args:
-        path: PLY file of the cloud.
         run: folder of the run, whose report shows it.
-        camera: of the run.
         show: takes points (N, 3) of each keyframe, metres, and their colours (N, 3), red, green and blue to 255.
     """
 

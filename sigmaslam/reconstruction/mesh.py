@@ -36,7 +36,6 @@ class DepthVolume:
 
     Args:
         voxel: side of a voxel of the cloud, metres.
-        camera: that sees the depths.
     """
 
     def __init__(self, voxel: float, camera: RectifiedStereo) -> None:

@@ -27,7 +27,6 @@ class PosedImages:
 
     Args:
         folder: new or empty.
-        camera: of the images.
     """
 
     def __init__(self, folder: Path, camera: RectifiedStereo) -> None:

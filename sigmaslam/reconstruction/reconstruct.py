@@ -197,9 +197,6 @@ def fuse_keyframes(
     """Depths of the keyframes, in order; images and disparities of a few of them are in memory at a time.
 
     Args:
-        keyframes: of a run.
-        sequence: its input.
-        rectifier: for the run's calibration.
         match: finds disparities to a pixel.
     """
     kept: dict[int, tuple[np.ndarray, DepthView]] = {}
@@ -233,10 +230,8 @@ def fuse_keyframe(
     """Depths of a keyframe, fused with the views around it.
 
     Args:
-        number: of the keyframe.
         views: by their numbers, pictures and views; those around the keyframe that there are.
         keyframes: poses of the views.
-        rectifier: for their calibration.
     """
     T_left_rectified = se3_inverse(rectifier.T_rectified_left)
     picture, view = views[number]

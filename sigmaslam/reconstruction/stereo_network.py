@@ -18,17 +18,16 @@ class StereoNetwork:
 
     Args:
         path: .onnx file.
-        threads: within one operator.
     Raises:
         InputError: the file is missing, or no such graph.
     """
 
-    def __init__(self, path: Path, threads: int = 2) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
         if not path.is_file():
             raise InputError(f"{path}: no such file: give the ONNX file of a stereo network")
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
+        options.intra_op_num_threads = 2
         options.log_severity_level = 3
         try:
             self._session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])

@@ -7,10 +7,10 @@ import jinja2
 from markupsafe import Markup
 
 
-def load_template(name: str) -> jinja2.Template:
-    """A template of the folder; it escapes what it is given."""
+def load_template(name: str, package: str = "sigmaslam.report") -> jinja2.Template:
+    """A template of a package; it escapes what it is given."""
     return jinja2.Environment(
-        loader=jinja2.PackageLoader("sigmaslam.report", "templates"),
+        loader=jinja2.PackageLoader(package, "templates"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -123,7 +123,6 @@ def write_page(
     """Write a page of time line, view and plots, with its styles and scripts inside.
 
     Args:
-        path: of the page.
         template: name of one that extends `page.html`.
         seconds: times of the frames of each run.
         plots: of `build_plots`; a series is of the run `run`, by default the first.

@@ -32,11 +32,7 @@ class RecordedPoints:
 
 
 def write_dense_points(path: Path, points: np.ndarray, sigma: np.ndarray, colours: np.ndarray) -> None:
-    """Writes an even selection of points.
-
-    Args:
-        points, sigma, colours: (N, 3), (N,) and (N, 3) as of `RecordedPoints`; float32 and uint8 are kept.
-    """
+    """Writes an even selection of points with sigma and colours, as of `RecordedPoints`; float32 and uint8 are kept."""
     rows = even_rows(len(points), MAX_POINTS)
     shades = np.clip(np.rint(colours[rows]), 0, 255).astype(np.uint8)
     metres, sigmas = points[rows].astype(np.float32), sigma[rows].astype(np.float32)

@@ -102,11 +102,7 @@ class _Picture:
 
 
 class PictureRecorder:
-    """Takes every frame of a run and keeps pictures of few, so that memory is bounded.
-
-    Args:
-        length: frames of the run, if that is known.
-    """
+    """Takes every frame of a run, `length` if that is known, and keeps pictures of few, so that memory is bounded."""
 
     def __init__(self, length: int | None) -> None:
         self._every = 1 if length is None else max(1, -(-length // MAX_PICTURES))

@@ -63,11 +63,7 @@ def write_pose_records(folder: Path, records: PoseRecords) -> None:
 
 
 def write_pose_table(path: Path, records: PoseRecords, frames: FrameTable) -> None:
-    """Writes poses as they were said, with the status of their frames.
-
-    Args:
-        frames: of the run, in order of time.
-    """
+    """Writes poses as they were said, with the status of their frames, which are in the order of time."""
     # frames.csv has nanoseconds.
     rows = np.searchsorted(frames.columns["timestamp"], records.timestamp - 5e-7)
     quaternions = matrix_to_quaternion(records.pose[:, :3, :3])

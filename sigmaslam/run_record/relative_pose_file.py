@@ -47,12 +47,7 @@ class RelativePoseWriter(AppendedFile):
 
 
 def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
-    """The relative poses that a run has left in its folder so far.
-
-    Args:
-        folder: of the run.
-        timestamps: (N,) of the frames with a pose, seconds, as they were tracked.
-    """
+    """The relative poses in the folder of a run so far, whose poses were tracked with time stamps (N,), seconds."""
     columns = read_rows(folder / PARTIAL_RELATIVE_POSES, (), (), (), (4, 4), (6, 6))
     known = columns[0] < len(timestamps)
     later, span, earlier_time, pose, covariance = (column[known] for column in columns)
@@ -62,13 +57,7 @@ def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
 
 
 def write_partial_frame_pairs(folder: Path, pairs: FramePairs, timestamps: np.ndarray) -> None:
-    """Writes relative poses as a run leaves them, so that it can go on.
-
-    Args:
-        folder: of the run.
-        pairs: what `collect_frame_pairs` returns.
-        timestamps: (N,) of the frames with a pose, seconds.
-    """
+    """Writes relative poses as a run leaves them, so that it can go on; its poses have time stamps (N,), seconds."""
     span = np.array([SPANS.index(span) for span in pairs.span], np.int64)
     content = pack_rows(pairs.later, span, timestamps[pairs.earlier], pairs.pose, pairs.covariance)
     atomic_write_bytes(folder / PARTIAL_RELATIVE_POSES, content)

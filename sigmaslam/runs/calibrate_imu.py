@@ -22,7 +22,6 @@ def calibrate_imu_by_run(
     """Calibrates a sensor that was recorded beside the images of a run; that run had best not used it (--imu off).
 
     Args:
-        folder: of the run.
         done: as of `calibrate_imu`.
     Returns:
         The calibration, and the run's camera.

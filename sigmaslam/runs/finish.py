@@ -20,8 +20,6 @@ def finish_run(run: Path) -> dict[str, Any] | None:
     The map, the tracks of `--tracks` and the trajectory after the fact were in memory alone: those that are not there
     are lost.
 
-    Args:
-        run: folder of the run.
     Returns:
         The summary in run.json; None where the run is finished, and nothing was to be done.
     Raises:

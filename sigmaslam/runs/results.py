@@ -72,7 +72,6 @@ def write_results(
     can be made of them.
 
     Args:
-        folder: of the run.
         run: entries of run.json beside the summary.
         calibration: what the last frame said of it; None: what is on disk of that.
         tracker: None for a run that was killed: the map and the trajectory after the fact are lost then.

@@ -44,7 +44,6 @@ class StoppedRun:
     """A run that goes on.
 
     Attributes:
-        folder: of the run.
         resumed_at: numbers of the frames from which it has gone on, the new one last.
         timestamps: (N,) of the frames that stay, in frames.csv, seconds; the last one has a pose.
         keyframe_at: time stamp of the last keyframe, seconds.
@@ -121,7 +120,6 @@ def read_stopped_run(folder: Path, run: dict[str, Any]) -> StoppedRun:
     """What a run has left, killed or stopped with its results; only a row that was cut off is removed by reading it.
 
     Args:
-        folder: of the run.
         run: entries of run.json that it would have if it began now.
     Raises:
         InputError: there is no run, it still goes on or is complete, it had other input or settings, or no frame of it

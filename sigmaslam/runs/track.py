@@ -113,20 +113,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         }
         if isinstance(tracker, ObjectTracker):
             run["object"] = run["object"] | {"origin": tracker.origin.tolist()}  # in the first left camera's frame
-        others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
-        if location is not None and (placed := location.trajectory()) is not None:
-            others["trajectory_location.tum"] = lambda path: write_tum(path, placed)
-        saved = request.outputs.save_calibration
-        if saved is not None and writer.calibration is not None and isinstance(tracker, StereoTracker):
-            focal_length = float(tracker.rectifier.describe()["intrinsics"][0])
-            learned = learned_calibration(sequence.camera, writer.calibration, focal_length)
-            others[str(saved.resolve())] = lambda path: write_calibration(path, learned)
-        # A sensor's readings correct poses as they come, not after the fact; what was before a stop is not in memory.
-        final = tracker.final_trajectory if location is None and stopped is None else None
-        judge_imu = None
-        if sequence.imu is not None and location is None:
-            judge_imu = partial(judge_motion, recording=sequence.imu)
-        results = TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write, judge_imu)
+        results = _collect_results(request, sequence, steps, writer, pictures, goes_on=stopped is not None)
         summary, failed = write_results(out, run, writer.calibration, results)
     if stopped_by is not None:
         raise stopped_by
@@ -236,6 +223,31 @@ class _FrameSteps:
         estimate = self.tracker.step(frame.left, frame.right, frame.timestamp, frame.mask)
         self.timing.note(frame.timestamp)
         return estimate if self.location is None else estimate.map_camera(self.location.fuse)
+
+
+def _collect_results(
+    request: TrackRequest,
+    sequence: StereoSequence,
+    steps: _FrameSteps,
+    writer: RunWriter,
+    pictures: PictureRecorder,
+    goes_on: bool,
+) -> TrackerResults:
+    """What is written when a run has ended, beside poses and frames."""
+    tracker, location, saved = steps.tracker, steps.location, request.outputs.save_calibration
+    others = {"tracks.npz": writer.write_tracks} if writer.has_tracks else {}
+    if location is not None and (placed := location.trajectory()) is not None:
+        others["trajectory_location.tum"] = lambda path: write_tum(path, placed)
+    if saved is not None and writer.calibration is not None and isinstance(tracker, StereoTracker):
+        focal_length = float(tracker.rectifier.describe()["intrinsics"][0])
+        learned = learned_calibration(sequence.camera, writer.calibration, focal_length)
+        others[str(saved.resolve())] = lambda path: write_calibration(path, learned)
+    # A sensor's readings correct poses as they come, not after the fact; what was before a stop is not in memory.
+    final = tracker.final_trajectory if location is None and not goes_on else None
+    judge_imu = None
+    if sequence.imu is not None and location is None:
+        judge_imu = partial(judge_motion, recording=sequence.imu)
+    return TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write, judge_imu)
 
 
 def _sensors(sequence: StereoSequence, tracker: Tracker) -> list[_Samples]:

@@ -47,7 +47,6 @@ def check_sample(motion: MotionFilter, name: str, timestamp: float, one: Any, ot
 
     Args:
         name: "imu" or "odometry".
-        timestamp, one, other: the sample.
     Raises:
         InputError: the tracker knows no such sensor, or the sample is no time and two vectors of finite numbers.
     """

@@ -8,12 +8,7 @@ T = TypeVar("T")
 
 
 class Deferred(Generic[T]):
-    """A value that is made once, by whoever needs it first; the same wherever it is made.
-
-    Args:
-        make: gives the value.
-        executor: begins at once to make it beside what goes on, if there is one.
-    """
+    """A value made once: at once by an executor if there is one, else by who needs it first; the same by both."""
 
     def __init__(self, make: Callable[[], T], executor: Executor | None = None) -> None:
         self._make = make

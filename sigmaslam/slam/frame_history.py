@@ -123,7 +123,6 @@ class FrameHistory:
         """Takes a frame; one without a pose has no row in the trajectory.
 
         Args:
-            estimate: what is said of it.
             predicted: motion since the last keyframe before it, without its images.
             filtered: the same with them, or again without where they gave no pose.
         """

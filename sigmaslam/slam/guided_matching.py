@@ -86,7 +86,6 @@ class GuidedMatcher:
         """Finds landmarks near where a predicted pose sees them.
 
         Args:
-            view: where they are searched for.
             keyframes: what the window's keyframes saw.
             pose: (4, 4) expected T_world_camera.
             covariance: (6, 6) of it relative to the keyframe `reference`, perturbed from the left in the world.

@@ -19,11 +19,7 @@ _LARGE_TURN = 0.1
 
 
 class LandmarkFollower:
-    """Remembers where landmarks were in the last frame, and finds them in the next one.
-
-    Args:
-        guided: predicts where they are.
-    """
+    """Remembers where landmarks were in the last frame, and finds them in the next one."""
 
     def __init__(self, guided: GuidedMatcher) -> None:
         self._guided = guided

@@ -117,11 +117,8 @@ class Mapper:
         """Makes a tracked frame a keyframe when the landmarks of the last one fade, and the frame can replace it.
 
         Args:
-            frame: the tracked one.
             timestamp: seconds.
-            fit: its pose.
             blur: of its image, as of `Keyframes.blur`.
-            matches: with the window's landmarks.
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
             doubts: in the pose, which something that moves may have drawn.
         """

@@ -108,7 +108,6 @@ def window_points(window: KeyframeWindow, keyframe_times: np.ndarray, min_views:
     Of those that were seen often enough and have more than half a pixel of disparity.
 
     Args:
-        window: whose landmarks.
         keyframe_times: (K,) time stamps of the window's keyframes.
         min_views: fewer do not count.
     """

@@ -6,8 +6,9 @@ import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.gaussian import robust_sigma
 from sigmaslam.frontend import StereoView
-from sigmaslam.frontend.lucas_kanade import in_light_of, lucas_kanade
+from sigmaslam.frontend.lucas_kanade import follow_both_ways, in_light_of
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.slam.frame import Frame
@@ -15,10 +16,9 @@ from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
 from sigmaslam.slam.localisation import Localiser, Prediction
 
-# Of the optical flow from eye to eye: side of its patches, pixels, and levels above the image; it reaches some 20 px.
-_WINDOW, _LEVELS = 21, 3
-# From the spread of right matches to their standard deviation, by the median.
-_ROBUST = 1.4826
+# Of the optical flow from eye to eye: side of its patches, pixels, levels above the image, there and back, and pixels
+# that the way back may miss by; it reaches some 20 px.
+_FLOW = 21, (3, 0), 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,6 @@ def find_change(
     Args:
         before: the last keyframe's.
         matches: landmarks that were followed to it, with disparities that may be wrong.
-        prediction: of its pose.
     """
     matches = replace(matches, views=replace(matches.views, measurement=matches.views.measurement * (1, 1, np.nan)))
     fit = localiser.fit_near(matches, prediction)
@@ -80,8 +79,7 @@ def find_change(
 def _spread(moved: np.ndarray, rays: np.ndarray) -> float:
     """Standard deviation of ways (M, 2), pixels, or of what a turn leaves of them, which moves the border farther."""
     ways = np.stack([moved, moved - (rays @ np.nanmedian(moved, axis=0))[:, None] * rays])
-    away = np.abs(ways - np.nanmedian(ways, axis=1, keepdims=True))
-    return float(_ROBUST * np.nanmedian(away, axis=1).max(axis=1).min())
+    return float(robust_sigma(ways - np.nanmedian(ways, axis=1, keepdims=True), axis=1).max(axis=1).min())
 
 
 def _moved(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> np.ndarray:
@@ -89,8 +87,6 @@ def _moved(left: np.ndarray, right: np.ndarray, uvd: np.ndarray) -> np.ndarray:
     moved, usable = np.full((len(uvd), 2), np.nan), np.isfinite(uvd).all(axis=1)
     places, right = uvd[usable, :2], in_light_of(left, right)
     expected = RectifiedStereo.right_pixels(uvd[usable])
-    found, ended = lucas_kanade(left, right, places, expected, _WINDOW, _LEVELS)
-    back, returned = lucas_kanade(right, left, found, places, _WINDOW, 0)
-    good = ended & returned & (np.linalg.norm(back - places, axis=1) < 1.0)
+    found, good = follow_both_ways(left, right, places, expected, *_FLOW)
     moved[usable] = np.where(good[:, None], found - expected, np.nan)
     return moved

@@ -70,7 +70,6 @@ class StereoTracker:
         camera: calibration of the raw images; they are rectified here.
         frontend: "learned", "sift", "orb", "klt", or one of your own.
         backend: "onnx", or "torch" (needs the extra `train`).
-        config: settings.
         admission: what may become a landmark; by default everything.
         threads: of the network; with more than one the features of a keyframe that is foreseen are made beside the
             tracking of its frame. The results are the same whether it was foreseen or not.

@@ -44,7 +44,6 @@ class UnguidedMatcher:
         """Pose of a view relative to a keyframe by all of its stereo features; None where too few agree.
 
         Args:
-            key, view: the keyframe's and the current one.
             excludes: as of `estimate_scene_pose`.
         """
         index = np.flatnonzero(np.isfinite(key.disparity))

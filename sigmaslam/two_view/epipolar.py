@@ -1,5 +1,6 @@
 """Relative orientation of two calibrated views from matches: the 5-point method, then least squares by covariance."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -89,8 +90,7 @@ def estimate_epipolar_pose(
     subset = agreeing[:: max(1, len(agreeing) // _SUBSET)]
     starts = [pose_of_essential(essential, rays0[subset], rays1[subset])]
     least = _PLANE_SHARE * len(subset)
-    # A pose and the next one have opposite directions, and the same epipolar lines.
-    starts += poses_of_plane(K, points0[subset], points1[subset], cv2.USAC_FAST, _SAMPLES, least)[::2]
+    starts += poses_of_plane(K, points0[subset], points1[subset], cv2.USAC_FAST, _SAMPLES, least)
     best: EpipolarPose | None = None
     for start in starts:
         R, direction = _refine_pose(rays, probability, *start)
@@ -138,8 +138,15 @@ class MatchedRays:
 def pose_of_essential(essential: np.ndarray, rays0: np.ndarray, rays1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The one of the four poses of an essential matrix that puts most points in front of both cameras."""
     Ra, Rb, direction = cv2.decomposeEssentialMat(essential)
-    poses = [(R, sign * direction.ravel()) for R in (Ra, Rb) for sign in (1.0, -1.0)]
-    return max(poses, key=lambda pose: int(_depths_positive(rays0, rays1, *pose)[0].sum()))
+    return most_in_front([(Ra, direction.ravel()), (Rb, direction.ravel())], rays0, rays1)
+
+
+def most_in_front(
+    poses: Sequence[tuple[np.ndarray, np.ndarray]], rays0: np.ndarray, rays1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The pose, of those with these directions or the opposite ones, with most points in front of both cameras."""
+    signed = [(R, sign * direction) for R, direction in poses for sign in (1.0, -1.0)]
+    return max(signed, key=lambda pose: int(_depths_positive(rays0, rays1, *pose)[0].sum()))
 
 
 def poses_of_plane(
@@ -148,7 +155,7 @@ def poses_of_plane(
     """Rotations and directions that a plane allows, if one homography explains so many of the matches; else none.
 
     Two poses explain the matches of a plane, and the 5-point method gives either. A homography may be that of a turn.
-    After each pose comes that of the opposite direction.
+    Each direction stands for the opposite one as well, of the same epipolar lines.
     """
     if len(points0) < MIN_MATCHES:
         return []
@@ -161,7 +168,7 @@ def poses_of_plane(
         (np.asarray(R), translation.ravel() / length)
         for R, translation, length in zip(rotations, translations, lengths, strict=True)
         if length > _MIN_PARALLAX
-    ]
+    ][::2]
 
 
 def _refine_pose(

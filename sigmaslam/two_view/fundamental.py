@@ -53,9 +53,7 @@ def estimate_fundamental(
     first with Geman and McClure's loss, then by the inliers alone.
 
     Args:
-        points0, points1: (M, 2) pixels.
-        probability: (M,) of the matches.
-        covariance: (M, 2, 2) of points1, pixels squared.
+        points0, points1, probability, covariance: as of `estimate_epipolar_pose`.
         sigma0: standard deviation of points0, each coordinate, pixels.
     Returns:
         None with fewer than eight probable matches, or where the consensus fails.

@@ -115,7 +115,6 @@ def describe_files(
     """Matches two image files, estimates their geometry, draws it, and describes it.
 
     Args:
-        path0, path1: image files.
         calibration: of the stereo pair that took them, in any form; None: the geometry of uncalibrated views.
         eyes: which of its cameras took which, "left" or "right".
         picture: PNG to draw.

@@ -15,6 +15,7 @@ from sigmaslam.two_view.epipolar import (
     EpipolarPose,
     MatchedRays,
     log_gain,
+    most_in_front,
     neighbours_factor,
     pose_of_essential,
     poses_of_plane,
@@ -84,15 +85,7 @@ def estimate_relative_orientation(
     Sampson's error, first with Geman and McClure's loss, then with one that is that of least squares up to three
     standard deviations. A match whose rays meet behind the cameras is moved to infinity, and costs what that takes.
     The covariance is that of the mixture of all poses found (Laplace's approximation of each), times what clusters of
-    errors add.
-
-    Args:
-        K: (3, 3) intrinsics of both images.
-        points0, points1: (M, 2) pixels.
-        probability: (M,) of the matches.
-        covariance: (M, 2, 2) of points1, pixels squared.
-    Returns:
-        The pose; None with fewer than 8 probable matches, or if the 5-point method fails.
+    errors add. Arguments, and None for a pose, are as of `estimate_epipolar_pose`.
     """
     probable = np.flatnonzero(probability >= MIN_PROBABILITY)
     if len(probable) < MIN_MATCHES:
@@ -151,9 +144,10 @@ def _starts(
     if np.shape(E) != (3, 3):
         return []
     agreeing = mask.ravel() > 0
-    starts = [pose_of_essential(E, rays.rays0[agreeing], rays.rays1[agreeing])]
+    seen = rays.rays0[agreeing], rays.rays1[agreeing]
     least = _PLANE_SHARE * float(agreeing.sum())
-    return starts + poses_of_plane(K, points0, points1, cv2.USAC_ACCURATE, _PLANE_SAMPLES, least)
+    plane = poses_of_plane(K, points0, points1, cv2.USAC_ACCURATE, _PLANE_SAMPLES, least)
+    return [pose_of_essential(E, *seen), *(most_in_front([pose], *seen) for pose in plane)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,6 +322,8 @@ def _turn_alone(rays: MatchedRays, best: _Fit) -> tuple[np.ndarray, np.ndarray] 
 
 def _on_plane(rays: MatchedRays, probability: np.ndarray, fit: _Fit) -> _Fit | None:
     """The fit by both coordinates of the inliers if they are on one plane within their errors, else None."""
+    if fit.inliers.sum() < MIN_MATCHES:
+        return None
     R, direction, squared, known = _fit_places(rays.chosen(fit.inliers), fit.R, fit.direction, slice(0, 8))
     flat = squared < _GATE**2
     scale = float(squared[flat].sum()) / max(2 * int(flat.sum()) - 8, 1)

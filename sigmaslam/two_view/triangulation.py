@@ -63,11 +63,7 @@ def triangulate_parallel(views: TwoViews, pixels: np.ndarray) -> np.ndarray:
 
 
 def triangulate_midpoint(views: TwoViews, pixels: np.ndarray) -> np.ndarray:
-    """Points (..., 3) in the middle of the shortest line between the two rays.
-
-    Args:
-        pixels: (..., 4) (u0, v0, u1, v1).
-    """
+    """Points (..., 3) in the middle of the shortest line between the rays of pixels (..., 4), (u0, v0, u1, v1)."""
     rays0, rays1 = _rays(views, pixels)
     R, t = views.T_1_0[:3, :3], views.T_1_0[:3, 3]
     # In camera 0: ray 0 starts at zero, ray 1 at the other centre.
@@ -81,11 +77,7 @@ def triangulate_midpoint(views: TwoViews, pixels: np.ndarray) -> np.ndarray:
 
 
 def triangulate_linear(views: TwoViews, pixels: np.ndarray) -> np.ndarray:
-    """Points (..., 3) that minimise the algebraic error of homogeneous coordinates (OpenCV's triangulatePoints).
-
-    Args:
-        pixels: (..., 4) (u0, v0, u1, v1).
-    """
+    """Points (..., 3) of (u0, v0, u1, v1) (..., 4) by least squares of homogeneous equations (OpenCV's)."""
     rays0, rays1 = _rays(views, pixels)
     shape = rays0.shape
     flat0, flat1 = (np.ascontiguousarray(rays.reshape(-1, 3)[:, :2].T) for rays in (rays0, rays1))

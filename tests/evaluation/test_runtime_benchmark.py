@@ -15,7 +15,7 @@ from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.readers import open_sequence
 from sigmaslam_benchmarks.tracking import runtime
 from sigmaslam_benchmarks.tracking.decoded_pairs import DecodedPairs, open_pairs, write_pairs
-from sigmaslam_benchmarks.tracking.runtime import time_everything, write_runtime
+from sigmaslam_benchmarks.tracking.runtime import TimingChoice, time_everything, write_runtime
 from sigmaslam_benchmarks.tracking.runtime_page import SEQUENCE, SIZE, TimedRun, format_runtime
 from sigmaslam_benchmarks.tracking.sequences_page import Omission
 from sigmaslam_benchmarks.tracking.stereo_peers import CuvslamPeer, MissingPeerError, OrbSlamPeer, orb_settings
@@ -79,7 +79,7 @@ def test_a_resized_camera_sees_the_same_rays(pairs: DecodedPairs, tmp_path: Path
 
 
 def test_methods_start_from_bytecode_as_where_they_are_installed(compiled_folders: list[str]):
-    assert isinstance(next(time_everything(None, ["ours"], ["kitti_raw_0926_0039_a"])), Omission)
+    assert isinstance(next(time_everything(TimingChoice(None, ["ours"], ["kitti_raw_0926_0039_a"]))), Omission)
     assert compiled_folders == [str(Path(sigmaslam.__file__).parent)]
 
 
@@ -154,7 +154,7 @@ def test_a_method_that_fails_is_left_out_where_it_fails(monkeypatch: pytest.Monk
         raise FailedMethodError("its process ended with code -11")
 
     monkeypatch.setattr(runtime, "time_method", fail)
-    results = list(time_everything(None, ("klt-pnp",), ["demo"], 2, 5))
+    results = list(time_everything(TimingChoice(None, ("klt-pnp",), ["demo"], 2, 5)))
     assert len(results) == 1 + len(runtime.SCALES)
     assert all(isinstance(result, Omission) and result.method == "klt-pnp" for result in results)
     assert "demo 320x240 (KLT + PnP) is left out: its process ended with code -11" in format_runtime(results, "", 2)
@@ -207,12 +207,12 @@ def test_sequences_that_are_not_there_are_left_out_with_a_note(tmp_path: Path, m
 @pytest.mark.parametrize("names", [{"methods": ["magic"]}, {"sequences": ["magic"]}])
 def test_an_unknown_name_is_refused_with_those_that_are_known(names: dict[str, list[str]]):
     with pytest.raises(InputError, match=r"'magic' is unknown; choose of (ours|kitti\w+), "):
-        next(time_everything(None, **names))
+        TimingChoice(None, **names)
 
 
 def test_frames_that_are_all_warm_up_are_refused():
     with pytest.raises(InputError, match="--frames is 3: give at least 4"):
-        next(time_everything(None, frames=3))
+        TimingChoice(None, frames=3)
 
 
 def test_the_command_line_offers_it():

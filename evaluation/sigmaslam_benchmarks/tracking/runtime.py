@@ -39,6 +39,37 @@ _DEMO = "demo"  # for those who have neither torch nor data
 
 
 @dataclass(frozen=True, slots=True)
+class TimingChoice:
+    """What is timed.
+
+    Attributes:
+        data: folder of the real data sets, if there is one.
+        methods: of `METHODS`.
+        sequences: of `SEQUENCES`, or "demo"; the image size is varied on the first that is there.
+        rounds: in which every method is run once.
+        frames: of each sequence, from its start.
+        renders: folder for these; a temporary one by default.
+    Raises:
+        InputError: a name is unknown, or there are too few frames.
+    """
+
+    data: Path | None
+    methods: Sequence[str] = METHODS
+    sequences: Sequence[str] = SEQUENCES
+    rounds: int = ROUNDS
+    frames: int = FRAMES
+    renders: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_names("method", self.methods, METHODS)
+        check_names("sequence", self.sequences, (*SEQUENCES, _DEMO))
+        if self.frames <= WARM_UP + 1:
+            raise InputError(
+                f"--frames is {self.frames}: give at least {WARM_UP + 2}, the first {WARM_UP} are not counted"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class _Test:
     """What the methods take turns at in a round.
 
@@ -69,49 +100,31 @@ def write_runtime(
 ) -> str:
     """Times everything, writes the page and returns it; what is below a line `<!-- notes -->` in the page is kept.
 
-    When it is stopped, what was measured until then is written.
-
-    Args:
-        methods: of `METHODS`.
-        sequences: of `SEQUENCES`, or "demo"; the image size is varied on the first that is there.
-        rounds: in which every method is run once.
-        frames: of each sequence, from its start.
-    Raises:
-        InputError: a name is unknown, or there are too few frames.
+    When it is stopped, what was measured until then is written. Arguments and errors are those of `TimingChoice`.
     """
-    results = time_everything(data, methods, sequences, rounds, frames, renders, note)
+    results = time_everything(TimingChoice(data, methods, sequences, rounds, frames, renders), note)
     return write_results_page(path, results, lambda found, complete: format_runtime(found, command, rounds, complete))
 
 
 def time_everything(
-    data: Path | None,
-    methods: Sequence[str] = METHODS,
-    sequences: Sequence[str] = SEQUENCES,
-    rounds: int = ROUNDS,
-    frames: int = FRAMES,
-    renders: Path | None = None,
-    note: Callable[[str], None] = lambda text: None,
+    choice: TimingChoice, note: Callable[[str], None] = lambda text: None
 ) -> Iterator[TimedRun | Omission]:
-    """Times everything, one process at a time; see `write_runtime`."""
-    check_names("method", methods, METHODS)
-    check_names("sequence", sequences, (*SEQUENCES, _DEMO))
-    if frames <= WARM_UP + 1:
-        raise InputError(f"--frames is {frames}: give at least {WARM_UP + 2}, the first {WARM_UP} are not counted")
+    """Times everything, one process at a time."""
     # As pip does it: from a checkout where Python may write no bytecode, a start takes 0.3 CPU seconds more.
     compileall.compile_dir(sigmaslam.__path__[0], quiet=2)
-    methods = [method for method in METHODS if method in methods]
+    methods, rounds = [method for method in METHODS if method in choice.methods], choice.rounds
     missing: set[str] = set()  # peers; each is told of once
     with ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         demo = stack.enter_context(as_file(files("sigmaslam_synthetic") / "demo"))
         first: tuple[str, DecodedPairs, Trajectory] | None = None
-        for name in (name for name in (*SEQUENCES, _DEMO) if name in sequences):
-            opened = _find(name, data, renders or scratch / "renders", demo, frames, note)
+        for name in (name for name in (*SEQUENCES, _DEMO) if name in choice.sequences):
+            opened = _find(name, choice, scratch, demo, note)
             if isinstance(opened, Omission):
                 note(f"{name} is left out: {opened.reason}")
                 yield opened
                 continue
-            pairs, truth = _decode(*opened, scratch / name, frames)
+            pairs, truth = _decode(*opened, scratch / name, choice.frames)
             first = first or (name, pairs, truth)
             every = [(method, threads) for threads in (1, 2) for method in methods]
             yield from _take_turns([_Test(SEQUENCE, name, pairs.size, pairs, truth, every)], rounds, missing, note)
@@ -120,17 +133,18 @@ def time_everything(
 
 
 def _find(
-    name: str, data: Path | None, renders: Path, demo: Path, frames: int, note: Callable[[str], None]
+    name: str, choice: TimingChoice, scratch: Path, demo: Path, note: Callable[[str], None]
 ) -> tuple[Path, Path] | Omission:
     """Source and truth of a sequence, which is rendered if it has to be; or why it is left out."""
     if name == _DEMO:
         return demo, demo / "poses.txt"
     if name == "room":
         try:
-            source = _render(renders, frames, note)
+            source = _render(choice.renders or scratch / "renders", choice.frames, note)
         except ImportError as error:
             return Omission(name, "", f"{error.name} is not installed: pip install 'sigmaslam[train]'")
         return source, source / "poses.txt"
+    data = choice.data
     if data is None or not (data / name).is_dir():
         return Omission(name, "", f"{data or 'no folder'} does not hold it: give the folder of the data with --data")
     return data / name, data / name / REAL[name]

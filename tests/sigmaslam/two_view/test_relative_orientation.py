@@ -116,6 +116,18 @@ def test_the_other_pose_of_a_plane_is_told_and_allowed_for():
 
 
 @pytest.mark.long
+def test_a_pose_that_no_match_agrees_with_is_not_that_of_a_plane(monkeypatch: pytest.MonkeyPatch):
+    """The camera goes towards a plane; the pose of the opposite direction is refined to one without inliers."""
+    scene, starts = views(1, FORWARD, plane=True), relative_orientation._starts
+
+    def both_ways(*given) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [(R, sign * direction) for R, direction in starts(*given) for sign in (1.0, -1.0)]
+
+    monkeypatch.setattr(relative_orientation, "_starts", both_ways)
+    assert np.degrees(np.abs(scene.errors(scene.estimate())).max()) < 30.0
+
+
+@pytest.mark.long
 def test_points_on_a_plane_count_in_both_coordinates_and_others_do_not(monkeypatch: pytest.MonkeyPatch):
     scenes = views(2, SIDEWAYS, 0.3, plane=True), views(2, SIDEWAYS, 0.3)
     found = [scene.estimate() for scene in scenes]
