@@ -126,7 +126,7 @@ def exchange_weights(graph: Path, old: Mapping[str, np.ndarray], new: Mapping[st
     transposed = {weight.T.tobytes(): name for name, weight in old.items() if weight.ndim == 2}
     for constant in model.graph.initializer:
         value, name = onnx.numpy_helper.to_array(constant), constant.name.partition(".")[2]
-        weight = new.get(name) if name in old else new.get(transposed.get(value.tobytes(), ""), np.empty(0)).T
+        weight = new.get(name) if name in old else new.get(transposed.get(value.tobytes(), ""), np.empty((0, 0, 0))).T
         if weight is not None and weight.shape == value.shape:
             constant.CopyFrom(onnx.numpy_helper.from_array(np.ascontiguousarray(weight), constant.name))
     onnx.save(model, out)

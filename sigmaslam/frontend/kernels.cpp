@@ -520,15 +520,17 @@ py::tuple stereo_equations(const std::array<double, 5>& camera, const Reals& lan
     return py::make_tuple(squared, equations);
 }
 
-// Means of squares of `side` numbers.
-std::vector<float> means(const std::vector<float>& values, int height, int width, int side) {
-    std::vector<float> out;
-    for (int i = 0; i < height; i += side)
-        for (int j = 0; j < width; j += side) {
+// Means of squares of SIDE numbers.
+template <int SIDE>
+std::vector<float> means(const float* values, int height, int width) {
+    std::vector<float> out(static_cast<size_t>(height / SIDE) * (width / SIDE));
+    float* to = out.data();
+    for (int i = 0; i < height; i += SIDE)
+        for (const float *from = values + static_cast<size_t>(i) * width, *end = from + width; from < end; from += SIDE) {
             float total = 0.f;
-            for (int r = 0; r < side; ++r)
-                for (int c = 0; c < side; ++c) total += values[static_cast<size_t>(i + r) * width + j + c];
-            out.push_back(total / static_cast<float>(side * side));
+            for (int r = 0; r < SIDE; ++r)
+                for (int c = 0; c < SIDE; ++c) total += from[r * width + c];
+            *to++ = total / static_cast<float>(SIDE * SIDE);
         }
     return out;
 }
@@ -543,7 +545,7 @@ std::vector<float> surroundings(const std::vector<float>& response, int height, 
     for (int i = 0; i < rows; ++i)
         for (int j = 0; j < columns; ++j)
             cells[i * columns + j] = cells[std::clamp(i, 1, rows - 2) * columns + std::clamp(j, 1, columns - 2)];
-    const std::vector<float> blocks = means(cells, rows, columns, CELL);
+    const std::vector<float> blocks = means<CELL>(cells.data(), rows, columns);
     const int high = rows / CELL, wide = columns / CELL;
     const float overall = std::accumulate(blocks.begin(), blocks.end(), 0.f) / static_cast<float>(blocks.size());
     std::vector<float> levels;
@@ -579,7 +581,7 @@ void fit_peak(const float* response, int width, int pixel, float* place) {
 }
 
 // The strongest blobs of an image, evened out over it: places (count, 2) and strengths (count,), zero where it has fewer.
-py::tuple strongest_blobs(const std::vector<float>& image, int height, int width, int count) {
+py::tuple strongest_blobs(const float* image, int height, int width, int count) {
     static const std::vector<float> taps = [] {
         std::array<double, BLOB_REACH + 2> smooth{};
         double sum = 0.0;
@@ -594,8 +596,8 @@ py::tuple strongest_blobs(const std::vector<float>& image, int height, int width
         }
         return made;
     }();
-    std::vector<float> response(image.size());
-    blob_response(image.data(), height, width, taps.data(), response.data());
+    std::vector<float> response(static_cast<size_t>(height) * width);
+    blob_response(image, height, width, taps.data(), response.data());
     std::vector<Blob> blobs;
     find_maxima(response.data(), surroundings(response, height, width).data(), height, width, blobs);
     const size_t found = std::min(blobs.size(), static_cast<size_t>(count));
@@ -619,9 +621,9 @@ py::tuple find_blobs(const Places& image, int count) {
     if (image.ndim() != 2 || image.shape(0) % 32 || image.shape(1) % 32 || image.shape(0) < 96 || image.shape(1) < 96)
         throw std::invalid_argument("sides of the image must be multiples of 32, from 96 on");
     const int height = static_cast<int>(image.shape(0)), width = static_cast<int>(image.shape(1)), half = count / 4;
-    const std::vector<float> full(image.data(), image.data() + image.size());
-    const py::tuple large = strongest_blobs(full, height, width, 2 * (count - half));
-    const py::tuple small = strongest_blobs(means(full, height, width, 2), height / 2, width / 2, 2 * half);
+    const py::tuple large = strongest_blobs(image.data(), height, width, 2 * (count - half));
+    const std::vector<float> halved = means<2>(image.data(), height, width);
+    const py::tuple small = strongest_blobs(halved.data(), height / 2, width / 2, 2 * half);
     return py::make_tuple(large[0], large[1], small[0], small[1]);
 }
 
