@@ -89,11 +89,7 @@ def detect(cells: Tensor, count: int) -> tuple[Tensor, Tensor]:
     Returns:
         keypoints (B, count, 2) pixels (u, v) and their strengths (B, count), zero where the image has fewer.
     """
-    return find_peaks(hessian_response(cells), count)
-
-
-def find_peaks(response: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """As `detect`, for any response (B, 16, h, w) in cells."""
+    response = hessian_response(cells)
     evened = response / _surroundings(response)
     flat = functional.pixel_shuffle(response, CELL)
     scores = functional.pixel_shuffle(evened, CELL)

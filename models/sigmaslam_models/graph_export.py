@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ class TracedModule:
     Attributes:
         traced, checked: arguments of the module, of other sizes.
         inputs, outputs: names in the graph.
+        optional: inputs that need not be given, as there are outputs `found_NAME`, which the graph loses.
         dynamic: of each argument the free axes, as `torch.onnx.export` takes them.
     """
 
@@ -38,6 +39,7 @@ class TracedModule:
     inputs: list[str]
     outputs: list[str]
     dynamic: tuple[Any, ...]
+    optional: tuple[str, ...] = ()
 
 
 def export_graph(
@@ -80,12 +82,40 @@ def export_graph(
         simplify(program.model)
         program.save(path, external_data=False)
         strip_origins(path)
+        if graph.optional:
+            _make_optional(path, graph.optional)
         difference = graph_difference(graph, path, compare or relative_difference)
         if not difference <= tolerance:
             raise SigmaSlamError(
                 f"{out.name} differs from torch by {difference:.2e}, more than {tolerance:.0e}: not written"
             )
     return difference
+
+
+def _make_optional(path: Path, names: Sequence[str]) -> None:
+    """Inputs `names` in place of outputs `found_NAME` (float32): what finds these runs where the first is left out."""
+    from onnx import compose, helper, load, numpy_helper, parser, save, utils  # only to write a graph
+
+    parts, found = utils.Extractor(load(path)), [f"found_{name}" for name in names]
+    inputs, outputs = ([each.name for each in values] for values in (parts.graph.input, parts.graph.output))
+    making = parts.extract_model(inputs, found).graph
+    compose.add_prefix_graph(making, "made_", rename_inputs=False, rename_value_infos=False, inplace=True)
+    making = helper.make_graph(making.node, "made", [], making.output, making.initializer)
+    given, kept = (" ".join(text.format(name) for name in names) for text in ("k_{0} = Identity ({0})", "k_{0}"))
+    keeping = parser.parse_graph(f"kept () => (float[n] {kept.replace(' ', ', float[n] ')}) {{ {given} }}")
+    model = parts.extract_model([*inputs, *found], [name for name in outputs if name not in found])
+    for each, name in zip(model.graph.input[-len(names) :], names, strict=True):
+        each.name = name
+        shape = [size.dim_value for size in each.type.tensor_type.shape.dim]
+        model.graph.initializer.append(numpy_helper.from_array(np.zeros(shape, np.float32), name))
+    nodes = [
+        helper.make_node("Size", [names[0]], ["size"]),
+        helper.make_node("Cast", ["size"], ["is_given"], to=9),  # to bool
+        helper.make_node("If", ["is_given"], found, then_branch=keeping, else_branch=making),
+    ]
+    for place, node in enumerate(nodes):
+        model.graph.node.insert(place, node)
+    save(model, path)
 
 
 def exchange_weights(graph: Path, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], out: Path) -> None:
@@ -96,7 +126,7 @@ def exchange_weights(graph: Path, old: Mapping[str, np.ndarray], new: Mapping[st
     transposed = {weight.T.tobytes(): name for name, weight in old.items() if weight.ndim == 2}
     for constant in model.graph.initializer:
         value, name = onnx.numpy_helper.to_array(constant), constant.name.partition(".")[2]
-        weight = new.get(name) if name in old else new.get(transposed.get(value.tobytes(), ""), np.empty(0)).T
+        weight = new.get(name) if name in old else new.get(transposed.get(value.tobytes(), ""), np.empty((0, 0, 0))).T
         if weight is not None and weight.shape == value.shape:
             constant.CopyFrom(onnx.numpy_helper.from_array(np.ascontiguousarray(weight), constant.name))
     onnx.save(model, out)
@@ -109,7 +139,7 @@ def graph_difference(graph: TracedModule, path: Path, compare: Compare) -> float
     with torch.no_grad():
         outputs = graph.module(*graph.checked)
     expected = [value.numpy() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
-    return compare(actual, expected)
+    return compare(actual, expected[: len(actual)])
 
 
 def relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) -> float:

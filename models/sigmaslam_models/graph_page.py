@@ -1,5 +1,6 @@
 """The page of the graphs that ship, and the table beside it: what each takes and gives, read from the files."""
 
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -66,11 +67,8 @@ def _rows(model: onnx.ModelProto, meanings: dict[str, str]) -> Iterator[tuple[st
 
 
 def _length(dimension: onnx.TensorShapeProto.Dimension) -> str:
-    """A length, or the name of one that is free; the exporter's own names say nothing."""
-    name = dimension.dim_param.replace("*", " ")
-    if not name:
-        return str(dimension.dim_value)
-    return "N" if name.startswith("u") and name[1:].isdigit() else name
+    """A length, or an expression of those that are free; N for what the exporter counts."""
+    return re.sub(r"\bu\d+\b", "N", dimension.dim_param.replace("*", " ")) or str(dimension.dim_value)
 
 
 def _load(path: Path) -> onnx.ModelProto:

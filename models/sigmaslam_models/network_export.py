@@ -17,7 +17,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_bytes, atomic_write_text, make_folder
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.inference.weight_manifest import check_weights, update_manifest
-from sigmaslam_models.extractor import EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
+from sigmaslam_models.extractor import BLOBS, EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam_models.feature_network import FeatureNetwork
 from sigmaslam_models.graph_export import TracedModule, exchange_weights, export_graph
 from sigmaslam_models.model_card import read_card, scoring_page
@@ -69,18 +69,13 @@ def export_scoring(run: Path, out: Path) -> dict[str, float]:
     """
     content = read_card(run / "matching.json")
     make_folder(out)
-    graphs = _scoring_graphs(
-        load_scorer(run / "scorer.safetensors"),
-        load_verifier(run / "verifier.safetensors"),
-        load_verifier(run / "place_verifier.safetensors", PLACE_COLUMNS),
-    )
-    differences = {
+    graphs = _load_scoring(run)
+    content["onnx_minus_torch"] = differences = {
         name: export_graph(
             graph, out / f"{name}.onnx", NETWORK_TOLERANCE, draft=_with_weights(name, run / f"{name}.safetensors")
         )
         for name, graph in graphs.items()
     }
-    content["onnx_minus_torch"] = differences
     for name in graphs:
         atomic_write_bytes(out / f"{name}.safetensors", (run / f"{name}.safetensors").read_bytes())
     atomic_write_text(out / "matching.json", json.dumps(content, indent=2) + "\n")
@@ -95,11 +90,7 @@ def network_graphs(folder: Path) -> dict[str, TracedModule]:
     if (folder / "features.onnx").is_file():
         graphs["features"] = _feature_graph(load_network(folder / "features.safetensors"))
     if (folder / "scorer.onnx").is_file():
-        graphs |= _scoring_graphs(
-            load_scorer(folder / "scorer.safetensors"),
-            load_verifier(folder / "verifier.safetensors"),
-            load_verifier(folder / "place_verifier.safetensors", PLACE_COLUMNS),
-        )
+        graphs |= _load_scoring(folder)
     return graphs
 
 
@@ -136,8 +127,9 @@ def _feature_graph(network: FeatureNetwork) -> TracedModule:
         (image, torch.tensor(512)),
         (other, torch.tensor(700)),
         ["image", "count"],
-        ["keypoints", "scores", "descriptors", "sigma"],
+        ["keypoints", "scores", "descriptors", "sigma", *(f"found_{name}" for name in BLOBS)],
         ({2: multiple * height, 3: multiple * width}, None),
+        BLOBS,
     )
 
 
@@ -150,6 +142,13 @@ def _load(module: _Module, weights: Path) -> _Module:
     except (RuntimeError, ValueError, SafetensorError) as error:
         raise InputError(f"{weights} does not hold the weights of this network: {error}") from error
     return module.eval()
+
+
+def _load_scoring(folder: Path) -> dict[str, TracedModule]:
+    scorer, verifier, place_verifier = (
+        folder / f"{name}.safetensors" for name in ("scorer", "verifier", "place_verifier")
+    )
+    return _scoring_graphs(load_scorer(scorer), load_verifier(verifier), load_verifier(place_verifier, PLACE_COLUMNS))
 
 
 def _scoring_graphs(

@@ -91,6 +91,15 @@ struct Alignment {
     float correlation;
 };
 
+constexpr int CELL = 4, BLOB_REACH = 4, BLOB_BORDER = 8;  // of the detector, as the constants below
+constexpr double BLOB_SIGMA = 1.4;
+constexpr float LEAST_RESPONSE = 1e-9f;
+
+struct Blob {
+    float strength;
+    int pixel;
+};
+
 #define FUNCTIONS "frontend/kernels.inc"
 #include "../both_ways.inc"
 
@@ -99,6 +108,9 @@ const auto examine_one = HAS_AVX2 ? wide::examine_one : plain::examine_one;
 const auto search_row = HAS_AVX2 ? wide::search_row : plain::search_row;
 const auto patch_energies = HAS_AVX2 ? wide::patch_energies : plain::patch_energies;
 const auto sum_derivatives = HAS_AVX2 ? wide::sum_derivatives : plain::sum_derivatives;
+const auto blob_response = HAS_AVX2 ? wide::blob_response : plain::blob_response;
+const auto cell_means = HAS_AVX2 ? wide::cell_means : plain::cell_means;
+const auto find_maxima = HAS_AVX2 ? wide::find_maxima : plain::find_maxima;
 
 Image view(const Grey& image) {
     if (image.ndim() != 2) throw std::invalid_argument("an image must be (H, W)");
@@ -508,6 +520,113 @@ py::tuple stereo_equations(const std::array<double, 5>& camera, const Reals& lan
     return py::make_tuple(squared, equations);
 }
 
+// Means of squares of SIDE numbers.
+template <int SIDE>
+std::vector<float> means(const float* values, int height, int width) {
+    std::vector<float> out(static_cast<size_t>(height / SIDE) * (width / SIDE));
+    float* to = out.data();
+    for (int i = 0; i < height; i += SIDE)
+        for (const float *from = values + static_cast<size_t>(i) * width, *end = from + width; from < end; from += SIDE) {
+            float total = 0.f;
+            for (int r = 0; r < SIDE; ++r)
+                for (int c = 0; c < SIDE; ++c) total += from[r * width + c];
+            *to++ = total / static_cast<float>(SIDE * SIDE);
+        }
+    return out;
+}
+
+// What the response is measured against in each cell: `_surroundings` of models/sigmaslam_models/detector.py.
+std::vector<float> surroundings(const std::vector<float>& response, int height, int width) {
+    constexpr int WINDOW = 2;  // blocks to either side
+    const int rows = height / CELL, columns = width / CELL;
+    std::vector<float> cells(rows * columns);
+    cell_means(response.data(), height, width, cells.data());
+    // The outermost cells respond to the border of the image.
+    for (int i = 0; i < rows; ++i)
+        for (int j = 0; j < columns; ++j)
+            cells[i * columns + j] = cells[std::clamp(i, 1, rows - 2) * columns + std::clamp(j, 1, columns - 2)];
+    const std::vector<float> blocks = means<CELL>(cells.data(), rows, columns);
+    const int high = rows / CELL, wide = columns / CELL;
+    const float overall = std::accumulate(blocks.begin(), blocks.end(), 0.f) / static_cast<float>(blocks.size());
+    std::vector<float> levels;
+    for (int i = 0; i < high; ++i)
+        for (int j = 0; j < wide; ++j) {
+            float total = 0.f;
+            int count = 0;
+            for (int r = std::max(i - WINDOW, 0); r <= std::min(i + WINDOW, high - 1); ++r)
+                for (int c = std::max(j - WINDOW, 0); c <= std::min(j + WINDOW, wide - 1); ++c, ++count) total += blocks[r * wide + c];
+            const float root = std::sqrt(std::max(total / static_cast<float>(count) + 0.05f * overall, 1e-14f));
+            levels.push_back(root * std::sqrt(root));  // to the power of 0.75
+        }
+    for (int i = 0; i < rows; ++i)
+        for (int j = 0; j < columns; ++j) {
+            const float v = std::max((i + 0.5f) / CELL - 0.5f, 0.f), u = std::max((j + 0.5f) / CELL - 0.5f, 0.f);
+            const int r = static_cast<int>(v), c = static_cast<int>(u), s = std::min(r + 1, high - 1), d = std::min(c + 1, wide - 1);
+            const float dv = v - static_cast<float>(r), du = u - static_cast<float>(c);
+            const float above = (1.f - du) * levels[r * wide + c] + du * levels[r * wide + d];
+            cells[i * columns + j] = (1.f - dv) * above + dv * ((1.f - du) * levels[s * wide + c] + du * levels[s * wide + d]);
+        }
+    return cells;
+}
+
+// Peak of the quadratic through 3x3 pixels: (u, v).
+void fit_peak(const float* response, int width, int pixel, float* place) {
+    const float *here = response + pixel, *above = here - width, *below = here + width;
+    const float du = 0.5f * (here[1] - here[-1]), dv = 0.5f * (below[0] - above[0]);
+    const float uu = here[1] - 2.f * here[0] + here[-1], vv = below[0] - 2.f * here[0] + above[0];
+    const float uv = 0.25f * (below[1] - above[1] - below[-1] + above[-1]), determinant = uu * vv - uv * uv;
+    const float scale = determinant > 1e-3f * std::fabs(uu * vv) ? 1.f / determinant : 0.f;
+    place[0] = static_cast<float>(pixel % width) + std::clamp(-scale * (vv * du - uv * dv), -0.75f, 0.75f);
+    place[1] = static_cast<float>(pixel / width) + std::clamp(-scale * (uu * dv - uv * du), -0.75f, 0.75f);
+}
+
+// The strongest blobs of an image, evened out over it: places (count, 2) and strengths (count,), zero where it has fewer.
+py::tuple strongest_blobs(const float* image, int height, int width, int count) {
+    static const std::vector<float> taps = [] {
+        std::array<double, BLOB_REACH + 2> smooth{};
+        double sum = 0.0;
+        for (int t = 0; t < BLOB_REACH; ++t)
+            sum += (t ? 2.0 : 1.0) * (smooth[t] = std::exp(-0.5 * t * t / (BLOB_SIGMA * BLOB_SIGMA)));
+        std::vector<float> made(3 * (BLOB_REACH + 1));
+        for (int t = 0; t <= BLOB_REACH; ++t) {
+            const double before = smooth[std::abs(t - 1)] / sum, here = smooth[t] / sum, after = smooth[t + 1] / sum;
+            made[t] = static_cast<float>(here);
+            made[BLOB_REACH + 1 + t] = static_cast<float>(BLOB_SIGMA * 0.5 * (before - after));
+            made[2 * (BLOB_REACH + 1) + t] = static_cast<float>(BLOB_SIGMA * BLOB_SIGMA * (before + after - 2.0 * here));
+        }
+        return made;
+    }();
+    std::vector<float> response(static_cast<size_t>(height) * width);
+    blob_response(image, height, width, taps.data(), response.data());
+    std::vector<Blob> blobs;
+    find_maxima(response.data(), surroundings(response, height, width).data(), height, width, blobs);
+    const size_t found = std::min(blobs.size(), static_cast<size_t>(count));
+    const auto is_better = [](const Blob& a, const Blob& b) {
+        return a.strength != b.strength ? a.strength > b.strength : a.pixel < b.pixel;
+    };
+    std::nth_element(blobs.begin(), blobs.begin() + found, blobs.end(), is_better);
+    std::sort(blobs.begin(), blobs.begin() + found, is_better);
+    Places places({count, 2}), strengths(count);
+    std::fill_n(places.mutable_data(), 2 * count, 0.f);
+    std::fill_n(strengths.mutable_data(), count, 0.f);
+    for (size_t k = 0; k < found; ++k) {
+        strengths.mutable_data()[k] = blobs[k].strength;
+        fit_peak(response.data(), width, blobs[k].pixel, places.mutable_data() + 2 * k);
+    }
+    return py::make_tuple(places, strengths);
+}
+
+// Blobs of an image in [0, 1] and of its half, as `detect_blobs` of models/sigmaslam_models/extractor.py gives them.
+py::tuple find_blobs(const Places& image, int count) {
+    if (image.ndim() != 2 || image.shape(0) % 32 || image.shape(1) % 32 || image.shape(0) < 96 || image.shape(1) < 96)
+        throw std::invalid_argument("sides of the image must be multiples of 32, from 96 on");
+    const int height = static_cast<int>(image.shape(0)), width = static_cast<int>(image.shape(1)), half = count / 4;
+    const py::tuple large = strongest_blobs(image.data(), height, width, 2 * (count - half));
+    const std::vector<float> halved = means<2>(image.data(), height, width);
+    const py::tuple small = strongest_blobs(halved.data(), height / 2, width / 2, 2 * half);
+    return py::make_tuple(large[0], large[1], small[0], small[1]);
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_kernels, module) {
@@ -521,4 +640,5 @@ PYBIND11_MODULE(_kernels, module) {
     module.def("select_spaced", &select_spaced);
     module.def("stereo_equations", &stereo_equations);
     module.def("neighbour_medians", &neighbour_medians);
+    module.def("find_blobs", &find_blobs);
 }

@@ -1,16 +1,13 @@
 """Our trained features: an ONNX graph, or the same network in torch."""
 
-from collections.abc import Callable, Mapping
-
 import cv2
 import numpy as np
 
+from sigmaslam.frontend.patch_kernels import compiled
 from sigmaslam.frontend.types import Features
 from sigmaslam.inference.backends import open_network
 from sigmaslam.inference.networks import WeightsFolder
-
-Graph = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
-"""A network as a function: a `sigmaslam.inference.onnx_graph.OnnxGraph`, or the same network in torch."""
+from sigmaslam.inference.onnx_graph import OnnxGraph, Step
 
 # Of the image's sides: the network's coarsest map is a 16th of the image at half the scale.
 _SIZE_MULTIPLE = 32
@@ -40,14 +37,14 @@ class LearnedDetector:
         weights: WeightsFolder = None,
     ) -> None:
         self._max_keypoints = max_keypoints
-        self._graph: Graph = open_network("features", weights, threads, provider, backend)
+        self._graph = open_network("features", weights, threads, provider, backend)
 
     def __call__(self, image: np.ndarray) -> Features:
         """Features of an (H, W) uint8 image of any size from 96 pixels."""
         return extract(self._graph, image, self._max_keypoints)
 
 
-def extract(graph: Graph, image: np.ndarray, max_keypoints: int) -> Features:
+def extract(graph: Step, image: np.ndarray, max_keypoints: int) -> Features:
     """Features of an (H, W) uint8 image by a graph with the inputs and outputs of the exported one.
 
     Args:
@@ -60,10 +57,11 @@ def extract(graph: Graph, image: np.ndarray, max_keypoints: int) -> Features:
     bottom, right = -height % _SIZE_MULTIPLE, -width % _SIZE_MULTIPLE
     padded = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
     count = np.array(min(max_keypoints, padded.size // _PIXELS_PER_KEYPOINT), np.int64)
-    shades = padded[None, None].astype(np.float32)
-    shades /= 255.0
-    keypoints, scores, descriptors, sigma = graph({"image": shades, "count": count})
+    shades = np.divide(padded[None, None], 255.0, dtype=np.float32)
+    feed: dict[str, np.ndarray] = {"image": shades, "count": count}
+    if isinstance(graph, OnnxGraph) and graph.optional and (kernels := compiled()):
+        feed |= zip(graph.optional, kernels.find_blobs(shades[0, 0], count), strict=True)
+    keypoints, scores, descriptors, sigma = graph(feed)[:4]
     # The padding contains no corners, but its seam may.
     inside = (keypoints[:, 0] < width - _BORDER) & (keypoints[:, 1] < height - _BORDER)
-    kept = np.flatnonzero((scores > 0) & inside)
-    return Features(keypoints[kept], descriptors[kept], scores[kept], sigma[kept])
+    return Features(keypoints, descriptors, scores, sigma).select((scores > 0) & inside)

@@ -46,7 +46,8 @@ class OnnxGraph:
         provider: where it computes, one of `sigmaslam.inference.session.PROVIDERS`.
 
     Attributes:
-        inputs: in the order of the graph.
+        inputs: in the order of the graph, without the optional ones.
+        optional: names of those.
         outputs: their names, likewise.
     Raises:
         InputError: the file is missing, not the one that its manifest names, or no usable graph, or the provider is
@@ -71,6 +72,7 @@ class OnnxGraph:
             GraphInput(each.name, each.type, tuple(size if isinstance(size, int) else None for size in each.shape))
             for each in self._session.get_inputs()
         )
+        self.optional: Sequence[str] = [each.name for each in self._session.get_overridable_initializers()]
         self.outputs: Sequence[str] = [output.name for output in self._session.get_outputs()]
 
     def __call__(self, feed: Mapping[str, np.ndarray]) -> list[np.ndarray]:

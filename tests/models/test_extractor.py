@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sigmaslam_models.detector import BORDER, detect, to_cells
-from sigmaslam_models.extractor import FeatureExtractor
+from sigmaslam_models.extractor import FeatureExtractor, find_blobs
 from sigmaslam_models.feature_network import DESCRIPTOR_SIZE, FeatureNetwork
 from sigmaslam_synthetic.rendering.textures import dead_leaves
 
@@ -28,12 +28,19 @@ def image() -> Tensor:
 
 def run(extractor: FeatureExtractor, image: Tensor, count: int) -> tuple[Tensor, ...]:
     with torch.no_grad():
-        return extractor(image, torch.tensor(count))
+        return extractor(image, torch.tensor(count))[:4]
 
 
 def distances(points0: Tensor, points1: Tensor) -> Tensor:
     """(N, M); `torch.cdist` is an eighth of a pixel off where there are many."""
     return (points0[:, None] - points1[None]).norm(dim=2)
+
+
+def level_of(extractor: FeatureExtractor, image: Tensor, count: int) -> tuple[Tensor, ...]:
+    """Keypoints of one scale alone."""
+    with torch.no_grad():
+        places, strengths = detect(to_cells(image), 2 * count)
+        return extractor._level(to_cells(image), places[0], strengths[0])
 
 
 def as_image(grey: np.ndarray) -> Tensor:
@@ -58,7 +65,7 @@ def test_as_many_unit_descriptors_as_were_wanted_come_best_first(extractor, imag
 def test_a_row_of_every_output_belongs_to_the_same_keypoint(extractor, image):
     """Few keypoints of many are the same rows: sorting moved all outputs alike."""
     keypoints, scores, descriptors, sigma = run(extractor, image, 400)
-    level = extractor._level(to_cells(image), 300)
+    level = level_of(extractor, image, 300)
     distance = distances(level[0], keypoints)
     nearest = distance.argmin(dim=1)
     assert distance.amin(dim=1).max() < 1e-4
@@ -101,8 +108,7 @@ def test_the_half_scale_level_is_the_half_image(extractor, image):
     """Its keypoints are those of the image shrunk by OpenCV, moved to the full image, with sigma doubled."""
     half = as_image(cv2.resize(image[0, 0].numpy(), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     keypoints, scores, descriptors, sigma = run(extractor, image, 160)
-    with torch.no_grad():
-        level = extractor._level(to_cells(half), 40)
+    level = level_of(extractor, half, 40)
     distance = distances(2.0 * level[0] + 0.5, keypoints)
     nearest, found = distance.argmin(dim=1), distance.amin(dim=1) < 1e-2
     assert found.float().mean() > 0.9
@@ -165,3 +171,38 @@ def test_a_keypoint_of_low_quality_scores_less(image):
         scores.append(run(FeatureExtractor(network), image, 100)[1])
     ratio = 1 / (1 + np.exp(3.0)) / 0.5
     torch.testing.assert_close(scores[1], ratio * scores[0], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width", "count"), [(96, 96, 1152), (96, 96, 4), (192, 352, 700), (480, 640, 1500)])
+def test_compiled_blobs_are_those_of_torch(height, width, count):
+    kernels = pytest.importorskip("sigmaslam.frontend._kernels", reason="installed without a compiler")
+    rng = np.random.default_rng(height + count)
+    grey = dead_leaves((height, width), rng) / 255.0 + 0.02 * rng.standard_normal((height, width))
+    grey = grey.clip(0, 1).astype(np.float32)
+    expected = [each.numpy() for each in find_blobs(as_image(grey), torch.tensor(count))]
+    found = kernels.find_blobs(grey, count)
+    assert [each.shape for each in found] == [each.shape for each in expected]
+    for places, strengths, their_places, their_strengths in (
+        found[:2] + tuple(expected[:2]),
+        found[2:] + tuple(expected[2:]),
+    ):
+        np.testing.assert_allclose(strengths, their_strengths, rtol=0, atol=1e-5 * their_strengths.max())
+        nearest = np.linalg.norm(places[:, None] - their_places[None], axis=2).min(axis=1)
+        # Round-off decides which of two blobs of nearly equal strength is the last.
+        assert (nearest[strengths > 0] < 1e-3).mean() > 0.995
+
+
+@pytest.mark.parametrize("grey", [0.0, 0.3, 1.0])
+def test_compiled_blobs_of_no_texture_have_no_strength(grey):
+    kernels = pytest.importorskip("sigmaslam.frontend._kernels", reason="installed without a compiler")
+    places, strengths, half_places, half_strengths = kernels.find_blobs(np.full((96, 128), grey, np.float32), 64)
+    assert np.isfinite([*places.ravel(), *half_places.ravel()]).all()
+    assert not strengths.any()
+    assert not half_strengths.any()
+
+
+@pytest.mark.parametrize("shape", [(96, 100), (64, 96), (96,)])
+def test_compiled_blobs_need_sides_as_the_network_does(shape):
+    kernels = pytest.importorskip("sigmaslam.frontend._kernels", reason="installed without a compiler")
+    with pytest.raises(ValueError, match="multiples of 32"):
+        kernels.find_blobs(np.zeros(shape, np.float32), 10)

@@ -12,7 +12,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
 from sigmaslam.inference.weight_manifest import read_manifest
 from sigmaslam_models import network_export
-from sigmaslam_models.extractor import FeatureExtractor
+from sigmaslam_models.extractor import BLOBS, FeatureExtractor, find_blobs
 from sigmaslam_models.feature_network import FeatureNetwork
 from sigmaslam_models.network_export import (
     export_features,
@@ -155,10 +155,19 @@ def test_shipped_features_equal_the_shipped_weights_in_torch():
         assert_same_features(OnnxGraph(path)(given), TorchFeatures(weights)(given))
 
 
+def test_shipped_features_of_given_blobs_are_those_of_its_own():
+    image = noisy_texture(160, 224, 4)
+    graph = OnnxGraph(shipped("features.onnx"))
+    blobs = find_blobs(torch.from_numpy(image), torch.tensor(320))
+    assert tuple(graph.optional) == BLOBS
+    given = dict(zip(BLOBS, (each.numpy() for each in blobs), strict=True))
+    assert_same_features(graph(feed(image, 320) | given), graph(feed(image, 320)))
+
+
 def test_shipped_weights_describe_a_texture():
     """Trained ones: the best keypoints have distinct descriptors, qualities that differ and sigmas of about a pixel."""
     path = shipped("features.safetensors")
-    _, scores, descriptors, sigma = TorchFeatures(path)(feed(noisy_texture(192, 256, 5), 200))
+    _, scores, descriptors, sigma = TorchFeatures(path)(feed(noisy_texture(192, 256, 5), 200))[:4]
     assert (scores > 0).all()
     assert scores.max() > 2 * scores.min()
     cosine = descriptors @ descriptors.T - 2 * np.eye(len(descriptors))

@@ -8,9 +8,9 @@ import numpy as np
 
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
-from sigmaslam.frontend.learned import Graph, extract
+from sigmaslam.frontend.learned import extract
 from sigmaslam.frontend.types import Features
-from sigmaslam.inference.onnx_graph import OnnxGraph
+from sigmaslam.inference.onnx_graph import OnnxGraph, Step
 from sigmaslam_benchmarks.matching.peer_extractors import PeerExtractor, read_signature
 
 MAX_KEYPOINTS = 1024
@@ -40,7 +40,7 @@ class LearnedExtractor:
         max_keypoints: of an image.
     """
 
-    def __init__(self, graph: Graph, max_keypoints: int = MAX_KEYPOINTS) -> None:
+    def __init__(self, graph: Step, max_keypoints: int = MAX_KEYPOINTS) -> None:
         self._graph, self._max_keypoints = graph, max_keypoints
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_999, CHI_SQUARE_MEDIAN
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE, LANDMARK_SIZE, MODELLED
 from sigmaslam_filters.core.plain_factors import invert
 from sigmaslam_filters.core.unrolled_factors import whiten
-from sigmaslam_filters.manifolds.se3_matrices import exp_se3, invert_se3, log_se3
+from sigmaslam_filters.manifolds.se3_matrices import exp_se3
 from sigmaslam_filters.robust import common_scale, student_weight
 from sigmaslam_models.estimator.residuals import UNKNOWN_VARIANCE, chi_square, mask_missing
 from sigmaslam_models.estimator.stereo_views import Scene, Slopes, by_state, linearise
@@ -215,43 +215,9 @@ class GatedStep(nn.Module):
         )
 
 
-class FrameEstimate(NamedTuple):
-    """What a frame's views make of its prior.
-
-    Attributes:
-        offset: (n,) mean of the state, from the prior's.
-        covariance: (n, n) of it.
-        agree: (M,) bool, the views that pass the gate.
-    """
-
-    offset: Tensor
-    covariance: Tensor
-    agree: Tensor
-
-    def relative_error(self, pose: Tensor, T_last_frame: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Error (6,) of the frame's pose relative to the last keyframe, in the world, and its covariance (6, 6).
-
-        Args:
-            pose: (4, 4) T_world_camera as it was expected: the frame's of `FrameViews.poses`.
-            T_last_frame: (4, 4) the truth.
-            last: (4, 4) T_world_camera of the last keyframe as it was expected.
-        """
-        last, pose = (exp_se3(self.offset[k : k + 6 or None]) @ T for k, T in ((-12, last), (-6, pose)))
-        error = log_se3(last @ T_last_frame @ invert_se3(pose))
-        difference = self.covariance[-6:] - self.covariance[-12:-6]
-        return error, difference[:, -6:] - difference[:, -12:-6]
-
-    def log_likelihood(self, pose: Tensor, T_last_frame: Tensor, last: Tensor) -> Tensor:
-        """() of the frame's true pose relative to the last keyframe, a Gaussian's; arguments as of `relative_error`."""
-        error, covariance = self.relative_error(pose, T_last_frame, last)
-        root = torch.linalg.cholesky(covariance)
-        whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)
-        return -0.5 * (whitened * whitened).sum() - torch.log(2.0 * torch.pi * torch.diagonal(root) ** 2).sum() / 2.0
-
-
 def update_frame(
     measurement: Tensor, noise: Tensor, frame: FrameViews, freedom: Tensor, robust: int = 2, gated: int = 3
-) -> FrameEstimate:
+) -> tuple[Tensor, Tensor, Tensor]:
     """The whole update as the run time makes it, in torch: for gradients, and for batches by `torch.func.vmap`.
 
     Args:
@@ -260,6 +226,8 @@ def update_frame(
         frame: what is seen, and the prior.
         freedom: () degrees of freedom of the errors' Student-t.
         robust, gated: how many linearisations there are with a robust loss, and at most with a gate.
+    Returns:
+        (n,) mean of the state, from the prior's; (n, n) its covariance; (M,) bool, the views that pass the gate.
     """
     zero, one = torch.zeros_like(frame.depth), torch.ones_like(frame.depth)
     offset, spread = torch.zeros_like(frame.factor[:, 0]), frame.factor @ frame.factor.mT
@@ -282,7 +250,7 @@ def update_frame(
                 for before, after in zip((offset, spread, moved), step[:3], strict=True)
             )
             inliers = torch.where(taken, inliers, agree)
-    return FrameEstimate(offset, spread, inliers & agree)
+    return offset, spread, inliers & agree
 
 
 def predicted(frame: FrameViews, offset: Tensor, spread: Tensor) -> tuple[Tensor, ...]:

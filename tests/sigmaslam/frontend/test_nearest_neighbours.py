@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sigmaslam.errors import InputError
-from sigmaslam.frontend import FRONTENDS, Frontend, StereoView, build_frontend
+from sigmaslam.frontend import FRONTENDS, Frontend, StereoView, build_frontend, patch_kernels
 from sigmaslam.frontend.classical import OrbDetector, SiftDetector
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.lucas_kanade import lucas_kanade, refine
@@ -376,6 +376,21 @@ def test_learned_features_lie_in_the_image_whatever_its_size(demo, shape):
     assert 20 < len(features.keypoints) <= 200
     assert (features.keypoints >= 0).all()
     assert (features.keypoints < (shape[1] - 7, shape[0] - 7)).all()
+
+
+def test_learned_features_are_the_same_without_a_compiler(demo, monkeypatch: pytest.MonkeyPatch):
+    frontend("learned")
+    pytest.importorskip("sigmaslam.frontend._kernels", reason="installed without a compiler")
+    detect, image = LearnedDetector(600), demo["images"][0, 0]
+    fast = detect(image)
+    monkeypatch.setattr(patch_kernels, "_kernels", None)
+    slow = detect(image)
+    assert len(fast.keypoints) == len(slow.keypoints)
+    distance = np.linalg.norm(fast.keypoints[:, None] - slow.keypoints[None], axis=2)
+    near, same = distance.argmin(axis=1), distance.min(axis=1) < 1e-3
+    assert same.mean() > 0.995  # round-off decides which of two of nearly equal score is the last
+    np.testing.assert_allclose(fast.scores[same], slow.scores[near[same]], atol=1e-5)
+    np.testing.assert_allclose(fast.descriptors[same], slow.descriptors[near[same]], atol=1e-4)
 
 
 def test_an_unknown_front_end_is_refused_with_the_known_ones():

@@ -90,7 +90,7 @@ def match_pair(network: FeatureNetwork, pair: Pair) -> PairMatches:
 
     def extract(image: np.ndarray) -> tuple[Tensor, Tensor]:
         features = extractor(torch.from_numpy(image)[None, None].to(device), torch.tensor(_KEYPOINTS))
-        keypoints, scores, descriptors, _ = (values.cpu() for values in features)
+        keypoints, scores, descriptors, _ = (values.cpu() for values in features[:4])
         return keypoints[scores > 0], descriptors[scores > 0]
 
     (keypoints0, descriptors0), (keypoints1, descriptors1) = extract(pair.image0), extract(pair.image1)
