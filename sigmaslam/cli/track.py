@@ -157,9 +157,7 @@ def track(
     denoise: Annotated[
         bool, typer.Option("--denoise", help="Filter noise out of the images first: for the dark; slow.")
     ] = False,
-    threads: Annotated[
-        int, typer.Option(min=1, help="Threads of the network and of OpenCV; from 2 on keyframes are foreseen.")
-    ] = 2,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of the network and of OpenCV.")] = 2,
     strict: Annotated[
         bool, typer.Option("--strict", help="Do not track where the check of the first frames warns of something.")
     ] = False,

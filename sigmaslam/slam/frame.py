@@ -1,7 +1,6 @@
 """One stereo pair on its way through the tracker."""
 
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import replace
 from functools import cached_property
 
@@ -13,14 +12,13 @@ from sigmaslam.frontend import Frontend, StereoView
 from sigmaslam.frontend.motion_blur import is_blurred
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.argument_checks import check_mask
-from sigmaslam.slam.deferred import Deferred
 
 # Patches have a radius of so many pixels: nearer to what is masked they show some of it.
 _MARGIN = 5
 
 
 class Frame:
-    """A rectified pair. Its features, which only keyframes need, are made when they are asked for, or foreseen.
+    """A rectified pair. Its features, which only keyframes need, are made when they are asked for.
 
     Args:
         left, right: (H, W) uint8, rectified.
@@ -40,17 +38,16 @@ class Frame:
         self.left = left
         self.right = right
         self.usable = usable
-        self._view = Deferred(lambda: replace(frontend.observe(left, right).within(usable), is_blurred=self.is_blurred))
 
     @cached_property
     def is_blurred(self) -> bool:
         """Motion has blurred the left image."""
         return is_blurred(self.left)
 
-    @property
+    @cached_property
     def view(self) -> StereoView:
         """The pair with its features and their disparities."""
-        return self._view.get()
+        return replace(self._observe(self.left, self.right).within(self.usable), is_blurred=self.is_blurred)
 
     def is_exchanged(self, last: StereoView, min_to_judge: int) -> bool:
         """Whether each image is the other eye's: hardly a disparity as they are, and many the other way round.
@@ -63,14 +60,6 @@ class Frame:
         if self.view.is_swapped(min_to_judge) or self.view.has_stereo(few, min_to_judge):
             return self.view.is_swapped(min_to_judge)
         return self._observe(*self._exchanged()).has_stereo(2 * few, min_to_judge)
-
-    def foresee(self, executor: Executor) -> None:
-        """Begins to make the view beside the tracking of the frame."""
-        self._view.begin(executor)
-
-    def finish(self) -> None:
-        """What has been foreseen and not yet begun is not needed."""
-        self._view.cancel()
 
 
 def usable_pixels(mask: np.ndarray | None, rectifier: StereoRectifier) -> np.ndarray | None:

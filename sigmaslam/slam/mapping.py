@@ -26,8 +26,6 @@ from sigmaslam.table import Table
 
 # Images of fewer pixels have landmarks closer together than the setting says, down to this share of it.
 _FULL_SPACING_FROM, _LEAST_SPACING = 640 * 480, 2 / 3
-# How fast the landmarks that a frame loses follow those of the last one.
-_LOSS_ADAPTATION = 0.5
 # The scene is no farther away than where its disparity is this, pixels.
 _MIN_DISPARITY = 0.5
 
@@ -96,13 +94,6 @@ class Mapper:
     admission: LandmarkAdmission
     config: TrackerConfig
     _landmarks_in_keyframe: int = field(default=0, init=False)
-    _last_count: int = field(default=0, init=False)
-    _loss: float = field(default=0.0, init=False)
-
-    @property
-    def keyframe_is_near(self) -> bool:
-        """The next frame will probably be a keyframe, if it loses as many landmarks as the last ones."""
-        return self._last_count - self._loss < self.config.keyframe_ratio * self._landmarks_in_keyframe
 
     def insert_if_due(
         self,
@@ -122,8 +113,6 @@ class Mapper:
             expected: step (4, 4) from the last keyframe without its images, and its covariance (6, 6).
             doubts: in the pose, which something that moves may have drawn.
         """
-        self._loss += _LOSS_ADAPTATION * (self._last_count - fit.count - self._loss)
-        self._last_count = fit.count
         share = fit.count / max(self._landmarks_in_keyframe, 1)
         if share >= self.config.keyframe_ratio:
             return None
@@ -189,7 +178,7 @@ class Mapper:
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()
-        self._landmarks_in_keyframe = self._last_count = len(seen)
+        self._landmarks_in_keyframe = len(seen)
         return KeyframeTracks(window.landmarks.id[seen.landmark], seen.measurement, seen.covariance)
 
     def _add_landmarks(self, view: StereoView, views: LandmarkViews, blur: float) -> np.ndarray:

@@ -28,7 +28,6 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.inference.networks import WeightsFolder
 from sigmaslam.slam.argument_checks import check_frame, check_sample, check_tracker_arguments
 from sigmaslam.slam.config import TrackerConfig
-from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.frame import Frame, usable_pixels
@@ -71,8 +70,7 @@ class StereoTracker:
         frontend: "learned", "sift", "orb", "klt", or one of your own.
         backend: "onnx", or "torch" (needs the extra `train`).
         admission: what may become a landmark; by default everything.
-        threads: of the network; with more than one the features of a keyframe that is foreseen are made beside the
-            tracking of its frame. The results are the same whether it was foreseen or not.
+        threads: of the network.
         start: pose of the first frame in the world of an earlier run, in which it was a keyframe; by default the left
             camera of the first frame is the world.
         provider: where ONNX Runtime computes the networks, "cpu", "cuda" or "openvino"; the estimator stays on the CPU.
@@ -108,9 +106,10 @@ class StereoTracker:
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         self._turn, self.config = Lock(), (config := config or TrackerConfig())
-        self._beside = ThreadPoolExecutor(1, "keyframe") if threads > 1 else None
         networks = config.max_keypoints, backend, threads, provider, weights
-        loading = Deferred(lambda: build_frontend(frontend, *networks), self._beside)
+        # The network is loaded beside all else.
+        beside = ThreadPoolExecutor(1)
+        loading = beside.submit(build_frontend, frontend, *networks)
         self.rectifier = StereoRectifier(camera)
         self._camera = rectified = self.rectifier.rectified
         self._T_rectified_left = turned = self.rectifier.T_rectified_left
@@ -125,7 +124,8 @@ class StereoTracker:
         self._course = course = Course()
         self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
-        self._frontend = frontend = loading.get()
+        self._frontend = frontend = loading.result()
+        beside.shutdown()
         update = FrameUpdate(window, config.iterations, bool(motion.sensors))
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
@@ -229,7 +229,6 @@ class StereoTracker:
             tracks = self._recovery.start_or_recover(frame.view, timestamp)
         if not is_repeated:
             self._follower.remember_frame(frame.left, matches, fit, tracks)
-        frame.finish()
         loop = self._loops.close() if tracks is not None else None
         clock.lap("map")
         # The images before it again, or too little in stereo.
@@ -267,8 +266,6 @@ class StereoTracker:
         prediction = Prediction.of(self._window, self._motion)
         guided = self._course.phase is Phase.TRACKING
         if guided and self._follower.is_ready:
-            if self._beside is not None and self._mapper.keyframe_is_near:
-                frame.foresee(self._beside)
             matches, fit = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
             if fit is not None:
                 return matches, fit, None

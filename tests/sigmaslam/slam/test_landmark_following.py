@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from threading import Event
 from typing import Any
 
 import cv2
@@ -17,12 +15,10 @@ from sigmaslam.frontend import Frontend, KeypointSearch, StereoView, TemporalMat
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import rotation_exp
 from sigmaslam.slam.config import TrackerConfig
-from sigmaslam.slam.deferred import Deferred
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_following import LandmarkFollower
-from sigmaslam.slam.mapping import Mapper
-from tests.support.estimates import Demo, statuses, track
+from tests.support.estimates import Demo, track
 
 SEARCHED = 200
 # So that there are some keyframes within few frames: every second one of the demo, and keyframes sooner.
@@ -210,74 +206,7 @@ def test_the_view_of_a_frame_is_made_once_and_only_if_it_is_asked_for(demo: Demo
     assert frontend.observed == 1
 
 
-def test_what_is_cancelled_before_it_begins_is_made_when_it_is_asked_for():
-    made, gate = [], Event()
-    with ThreadPoolExecutor(1) as beside:
-        beside.submit(gate.wait)
-        deferred = Deferred(lambda: made.append(1) or 7)
-        deferred.begin(beside)
-        deferred.cancel()
-        gate.set()
-    assert not made
-    assert [deferred.get(), deferred.get()] == [7, 7]
-    assert len(made) == 1
-
-
-def test_a_view_that_was_foreseen_is_the_same_to_the_bit_and_made_once(demo: Demo, learned: Frontend):
-    frontend = CountingFrontend(learned)
-    with ThreadPoolExecutor(1) as beside:
-        for frame in demo[1][5:8]:
-            plain, foreseen = (Frame(frame.left, frame.right, frontend) for _ in range(2))
-            foreseen.foresee(beside)
-            expected = arrays_of(plain.view)
-            for name, array in arrays_of(foreseen.view).items():
-                np.testing.assert_array_equal(array, expected[name], err_msg=name)
-            assert foreseen.view is foreseen.view
-    assert frontend.observed == 6
-
-
-def test_what_goes_wrong_beside_the_tracking_is_raised_where_the_view_is_asked_for(demo: Demo, learned: Frontend):
-    class Broken(CountingFrontend):
-        def observe(self, left: np.ndarray, right: np.ndarray) -> StereoView:
-            raise MemoryError("as if")
-
-    frame = Frame(demo[1][0].left, demo[1][0].right, Broken(learned))
-    with ThreadPoolExecutor(1) as beside:
-        frame.foresee(beside)
-        with pytest.raises(MemoryError, match="as if"):
-            _ = frame.view
-
-
 # The tracker
-
-
-@pytest.mark.long
-def test_poses_do_not_depend_on_which_keyframes_are_foreseen(demo: Demo, monkeypatch: pytest.MonkeyPatch):
-    """To the bit, with as many threads of the network: all frames foreseen against none."""
-    camera, frames, _ = demo
-    runs, foreseen = [], []
-    foresee = Frame.foresee
-    monkeypatch.setattr(Frame, "foresee", lambda frame, executor: (foreseen.append(frame), foresee(frame, executor)))
-    for near in (True, False):
-        monkeypatch.setattr(Mapper, "keyframe_is_near", property(lambda mapper, near=near: near))
-        runs.append(track(StereoTracker(camera, config=OFTEN, threads=2), frames[::EVERY][:FRAMES]))
-        assert len(foreseen) == FRAMES - 2  # the first two have no prediction
-    assert statuses(runs[0]) == ["starting"] + ["tracking"] * (FRAMES - 1)
-    assert sum(estimate.tracks is not None for estimate in runs[0]) >= 3
-    for a, b in zip(*runs, strict=True):
-        assert a.status == b.status
-        np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
-        np.testing.assert_array_equal(a.covariance, b.covariance)
-        assert (a.tracks is None) == (b.tracks is None)
-        if a.tracks is not None and b.tracks is not None:
-            np.testing.assert_array_equal(a.tracks.measurement, b.tracks.measurement)
-            np.testing.assert_array_equal(a.tracks.covariance, b.tracks.covariance)
-
-
-def test_one_thread_foresees_nothing(demo: Demo, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(Mapper, "keyframe_is_near", property(lambda mapper: True))
-    monkeypatch.setattr(Frame, "foresee", lambda *arguments: pytest.fail("foreseen with one thread"))
-    track(StereoTracker(demo[0], threads=1), demo[1][:4])
 
 
 @pytest.mark.long
