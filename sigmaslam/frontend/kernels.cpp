@@ -616,7 +616,7 @@ py::tuple strongest_blobs(const float* image, int height, int width, int count) 
     return py::make_tuple(places, strengths);
 }
 
-// Blobs of an image in [0, 1] and of its half, as `detect_blobs` of models/sigmaslam_models/extractor.py gives them.
+// Blobs of an image in [0, 1] and of its half, as `find_blobs` of models/sigmaslam_models/extractor.py gives them.
 py::tuple find_blobs(const Places& image, int count) {
     if (image.ndim() != 2 || image.shape(0) % 32 || image.shape(1) % 32 || image.shape(0) < 96 || image.shape(1) < 96)
         throw std::invalid_argument("sides of the image must be multiples of 32, from 96 on");

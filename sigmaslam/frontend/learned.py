@@ -15,6 +15,8 @@ _SIZE_MULTIPLE = 32
 _BORDER = 8
 # The graph describes twice as many candidates; one in four comes from an image with a quarter of the pixels.
 _PIXELS_PER_KEYPOINT = 8
+# Pixels of a side, from which on compiled code finds the blobs; smaller images are the graph's alone.
+_LEAST_COMPILED = 96
 
 
 class LearnedDetector:
@@ -59,7 +61,8 @@ def extract(graph: Step, image: np.ndarray, max_keypoints: int) -> Features:
     count = np.array(min(max_keypoints, padded.size // _PIXELS_PER_KEYPOINT), np.int64)
     shades = np.divide(padded[None, None], 255.0, dtype=np.float32)
     feed: dict[str, np.ndarray] = {"image": shades, "count": count}
-    if isinstance(graph, OnnxGraph) and graph.optional and (kernels := compiled()):
+    is_large = min(padded.shape) >= _LEAST_COMPILED
+    if is_large and isinstance(graph, OnnxGraph) and graph.optional and (kernels := compiled()):
         feed |= zip(graph.optional, kernels.find_blobs(shades[0, 0], count), strict=True)
     keypoints, scores, descriptors, sigma = graph(feed)[:4]
     # The padding contains no corners, but its seam may.

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam_models.detector import BORDER, detect, to_cells
 from sigmaslam_models.extractor import FeatureExtractor, find_blobs
 from sigmaslam_models.feature_network import DESCRIPTOR_SIZE, FeatureNetwork
@@ -206,3 +207,11 @@ def test_compiled_blobs_need_sides_as_the_network_does(shape):
     kernels = pytest.importorskip("sigmaslam.frontend._kernels", reason="installed without a compiler")
     with pytest.raises(ValueError, match="multiples of 32"):
         kernels.find_blobs(np.zeros(shape, np.float32), 10)
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (240, 33), (96, 96)])
+def test_small_images_have_features_too(shape):
+    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    features = LearnedDetector(1500, threads=1)(image)
+    assert len(features.keypoints) > 100
+    assert (features.keypoints < shape[::-1]).all()
