@@ -1,5 +1,6 @@
 """The tracker: one stereo pair in, one pose with covariance out."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -107,9 +108,11 @@ class StereoTracker:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
         self._turn, self.config = Lock(), (config := config or TrackerConfig())
         networks = config.max_keypoints, backend, threads, provider, weights
-        # The network is loaded beside all else.
-        beside = ThreadPoolExecutor(1)
-        loading = beside.submit(build_frontend, frontend, *networks)
+        load: Callable[[], Frontend] = partial(build_frontend, frontend, *networks)
+        if threads > 1:  # beside all else that a start needs
+            beside = ThreadPoolExecutor(1, "loading")
+            load = beside.submit(load).result
+            beside.shutdown(wait=False)
         self.rectifier = StereoRectifier(camera)
         self._camera = rectified = self.rectifier.rectified
         self._T_rectified_left = turned = self.rectifier.T_rectified_left
@@ -124,8 +127,7 @@ class StereoTracker:
         self._course = course = Course()
         self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
-        self._frontend = frontend = loading.result()
-        beside.shutdown()
+        self._frontend = frontend = load()
         update = FrameUpdate(window, config.iterations, bool(motion.sensors))
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)

@@ -195,7 +195,7 @@ def test_wrong_options_of_match_images_are_refused(options: dict[str, Any], word
         sigmaslam.match_images(IMAGE, IMAGE, **{"frontend": "sift", **options})
 
 
-@pytest.mark.parametrize(("threads", "name"), [(1, "MainThread"), (2, "keyframe")])
+@pytest.mark.parametrize(("threads", "name"), [(1, "MainThread"), (2, "loading")])
 def test_networks_are_loaded_beside_what_else_a_start_needs(
     demo_sequence: Path, monkeypatch: pytest.MonkeyPatch, threads: int, name: str
 ):
