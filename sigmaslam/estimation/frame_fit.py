@@ -26,6 +26,12 @@ class FramePosterior:
     information: np.ndarray
     score: np.ndarray
 
+    @property
+    def relative(self) -> np.ndarray:
+        """(6, 6) covariance of the frame's pose relative to the window's last one."""
+        last, frame, cross = self.covariance[-12:-6, -12:-6], self.covariance[-6:, -6:], self.covariance[-6:, -12:-6]
+        return np.asarray(frame + last - cross - cross.T)
+
 
 @dataclass(frozen=True, slots=True)
 class FrameFit:

@@ -62,6 +62,8 @@ class KeyframeWindow:
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
         exceeded: (15,) bool, estimated errors beyond four standard deviations of their prior.
         worse: factor by which errors that images show are larger than their standard deviations, 1 or more.
+        clustering: factor by which errors that neighbours share make variances too small, 1 or more: of poses that are
+            published.
     """
 
     def __init__(
@@ -82,7 +84,8 @@ class KeyframeWindow:
         self.expected, self.exceeded = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE, bool)
         self.held_offset = HeldOffset()
         self.board_disparity: float | None = None
-        self.worse = 1.0
+        self.worse, self.clustering = 1.0, 1.0
+        self.published: tuple[WindowState, tuple[float, float], WindowState] | None = None
         self.prior = self.posterior = WindowState.initial(calibration)
         self.landmarks = LandmarkTable.empty(CALIBRATION_SIZE)
         self.places: tuple[WindowState, np.ndarray, np.ndarray, np.ndarray] | None = None

@@ -1,23 +1,48 @@
-"""What users see of a window: errors of the calibration are as large as the images show them to be.
+"""What users see of a window: errors of the calibration are as large as the images show them to be, and what neighbours
+in the image share counts in all poses.
 
 Poses are estimated without: gates and weights that know of larger errors would move them.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN
+from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.window_state import WindowState, scale_considered
+from sigmaslam.estimation.window_state import WindowState, scale_considered, scale_variances
 
 
 def published_state(window: KeyframeWindow) -> WindowState:
     """The posterior with these errors."""
-    if window.worse == 1.0:
+    given = window.worse, window.clustering
+    if given == (1.0, 1.0):
         return window.posterior
-    return scale_considered(window.posterior, considered_growth(window))
+    last = window.published
+    if last is None or last[0] is not window.posterior or last[1] != given:
+        state = scale_considered(window.posterior, _considered_growth(window))
+        last = window.published = window.posterior, given, scale_variances(state, window.clustering)
+    return last[2]
 
 
-def considered_growth(window: KeyframeWindow) -> np.ndarray:
+def published_fit(window: KeyframeWindow, fit: FrameFit) -> FrameFit:
+    """A frame's fit to the posterior as one to `published_state`."""
+    factor, joint = window.clustering, fit.joint
+    published = replace(
+        joint,
+        covariance=factor * joint.covariance,
+        common=joint.common * _considered_growth(window),
+        information=joint.information / factor,
+        score=joint.score / factor,
+    )
+    # Errors that the frame's own views share are in `fit.inflation`: once is enough.
+    twice = min(factor, fit.inflation) - 1.0
+    covariance = fit.covariance + published.covariance[-6:, -6:] - joint.covariance[-6:, -6:] - twice * joint.relative
+    return replace(fit, covariance=covariance, joint=published)
+
+
+def _considered_growth(window: KeyframeWindow) -> np.ndarray:
     """(15,) what columns of considered errors are multiplied by: those that images show by how much worse it is."""
     if window.worse == 1.0:
         return np.ones(len(ERRORS))

@@ -5,7 +5,7 @@ since, are in it. What the tracker knows of the way from a keyframe to the frame
 between the two, which is forgotten when the next frame comes.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.published_state import considered_growth
 from sigmaslam.estimation.relative_covariance import frame_relative_to, last_relative_to
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import se3_adjoint, se3_inverse
@@ -75,7 +74,7 @@ class RelativePoseReporter:
         Args:
             timestamp: of the frame, seconds.
             state: of the window, with poses, as it is published.
-            fit: its fit to the window; None: the last keyframe moved on, be it the frame itself or a prediction.
+            fit: its fit to that; None: the last keyframe moved on, be it the frame itself or a prediction.
         """
         self._note_keyframes()
         prediction = Prediction.of(self._window, self._motion)
@@ -89,8 +88,7 @@ class RelativePoseReporter:
             earlier, covariance = last_relative_to(state, index)
             covariance = covariance + prediction.covariance
         else:
-            joint = replace(fit.joint, common=fit.joint.common * considered_growth(self._window))
-            earlier, covariance = frame_relative_to(state, joint, index)
+            earlier, covariance = frame_relative_to(state, fit.joint, index)
             # What the fit was inflated by is the frame's alone.
             covariance = covariance + (fit.covariance - fit.joint.covariance[-6:, -6:])
         T_left_rectified = se3_inverse(self._T_rectified_left)

@@ -9,7 +9,7 @@ from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.held_offset import IN_COMMON
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.published_state import considered_growth, published_state
+from sigmaslam.estimation.published_state import published_fit, published_state
 from sigmaslam.estimation.state_layout import CALIBRATION, pose_slice
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -60,9 +60,9 @@ class Reporter:
             return self._report_nothing(timestamp, status, milliseconds)
         if fit is not None:
             # Published alone: a prediction as wide as that would find nothing.
-            fit = fit.spread_by(doubts.spread)
+            fit = published_fit(self.window, fit).spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
-            by_error, offset = fit.joint.common[-6:] * considered_growth(self.window), float(fit.calibration[0])
+            by_error, offset = fit.joint.common[-6:], float(fit.calibration[0])
             covariance, part = fit.joint.covariance, slice(-6, None)
         else:
             prediction = Prediction.of(self.window, self.motion)
@@ -124,7 +124,7 @@ class Reporter:
         errors, covariance, common = state.calibration, state.covariance, state.common
         if fit is not None and self.window.held_offset.value is None:
             errors, covariance = fit.calibration, fit.joint.covariance
-            common = fit.joint.common * considered_growth(self.window)
+            common = fit.joint.common
         common = common[CALIBRATION]
         sigma = np.sqrt(np.maximum(np.diag(covariance[CALIBRATION, CALIBRATION] + common @ common.T), 0.0))
         chosen = [k for k in np.flatnonzero(self.window.calibration.estimated).tolist() if k]

@@ -19,7 +19,7 @@ from sigmaslam.estimation.calibration_evidence import CalibrationEvidence
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
-from sigmaslam.estimation.published_state import published_state
+from sigmaslam.estimation.published_state import published_fit, published_state
 from sigmaslam.estimation.relative_covariance import frame_relative_to, last_relative_to
 from sigmaslam.estimation.state_layout import CALIBRATION, CALIBRATION_SIZE
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
@@ -327,3 +327,35 @@ def test_what_is_published_of_a_bad_calibration_is_as_if_its_sigmas_had_been_lar
         np.testing.assert_allclose(found / np.outer(scale, scale), wanted / np.outer(scale, scale), atol=1e-4)
     assert np.array_equal(published_state(given).poses, given.posterior.poses)
     assert np.trace(published_state(given).whole_covariance) > 1.5 * np.trace(given.posterior.whole_covariance)
+
+
+def test_what_neighbours_share_is_published_as_if_all_that_poses_come_from_were_so_much_less_certain():
+    certain = without_errors(moving_on(GIVEN, SIGMA))
+    window, given = certain.window, certain.window.posterior
+    window.clustering = 2.0
+    state, found = published_state(window), published_fit(window, certain.fit)
+    earlier = np.arange(KEYFRAMES - 1)
+    for relate, before, now in (
+        (last_relative_to, (given,), (state,)),
+        (frame_relative_to, (given, certain.fit.joint), (state, found.joint)),
+    ):
+        (poses, covariance), (published, wider) = relate(*before, earlier), relate(*now, earlier)
+        np.testing.assert_allclose(published, poses, atol=1e-12)
+        scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        np.testing.assert_allclose(
+            wider / scale[:, None] / scale[..., None], 2.0 * covariance / scale[:, None] / scale[..., None], atol=1e-9
+        )
+    assert np.array_equal(state.poses, given.poses)
+    assert published_state(window) is state
+
+
+@pytest.mark.parametrize(("own", "counted"), [(1.0, 0.0), (1.5, 0.0), (5.0, 3.0)])
+def test_what_a_frame_was_inflated_by_is_counted_once(own: float, counted: float):
+    """`counted`: of the frame's own covariance, beside what is published of all poses."""
+    solution = moving_on(GIVEN, SIGMA)
+    solution.window.clustering = 2.0
+    last, frame = slice(-12, -6), slice(-6, None)
+    joint = solution.fit.joint.covariance
+    relative = joint[frame, frame] + joint[last, last] - joint[frame, last] - joint[last, frame]
+    published = published_fit(solution.window, solution.fit.inflated(own)).covariance
+    np.testing.assert_allclose(published, 2.0 * joint[frame, frame] + counted * relative, rtol=1e-6)
