@@ -247,6 +247,27 @@ def test_frames_that_see_landmarks_of_a_streaked_keyframe_share_what_its_pose_le
             assert not more.any()
 
 
+def test_what_neighbours_share_in_keyframes_makes_poses_less_certain_and_moves_none(
+    demo: Demo, monkeypatch: pytest.MonkeyPatch
+):
+    camera, frames, _ = demo
+    insert, runs = Mapper.insert_if_due, []
+    for clustering in (1.0, 4.0):
+
+        def insert_clustered(mapper: Mapper, *given: Any, factor: float = clustering) -> KeyframeTracks | None:
+            fit = given[2]
+            shared = replace(fit, clustering=factor, inflation=fit.inflation * factor / fit.clustering)
+            return insert(mapper, *given[:2], shared, *given[3:])
+
+        monkeypatch.setattr(Mapper, "insert_if_due", insert_clustered)
+        runs.append(track(StereoTracker(camera), frames[:FRAMES]))
+    last = [run[-1] for run in runs]
+    for one, other in zip(*runs, strict=True):
+        np.testing.assert_allclose(one.T_world_camera, other.T_world_camera, atol=1e-12)
+        assert np.linalg.eigvalsh(other.covariance - one.covariance)[0] >= -1e-9 * np.trace(one.covariance)
+    assert 1.5 < np.trace(last[1].matching_covariance) / np.trace(last[0].matching_covariance) < 4.0
+
+
 def test_eyes_that_do_not_fit_make_all_poses_doubtful_and_less_certain(demo: Demo):
     camera, frames, _ = demo
     sure, unsure = StereoTracker(camera), StereoTracker(camera, disparity_error=2.0)
