@@ -8,7 +8,7 @@ import numpy as np
 from sigmaslam.checks.calibration import check_calibration
 from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
 from sigmaslam.checks.finding import Finding, has_errors, wrong
-from sigmaslam.checks.images import check_images, check_light, describe_frames
+from sigmaslam.checks.images import check_images, check_light, check_overlay, describe_frames
 from sigmaslam.checks.inertial import check_inertial, check_times
 from sigmaslam.checks.inertial_agreement import check_motion
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
@@ -76,7 +76,8 @@ def check_sequence(
     if not steps:
         return Check(findings, [], [], EyeMatches.empty())
     images = check_images([(frame.left, frame.right) for frame, _ in steps])
-    findings += [*images, check_light([frame for frame, _ in steps])]
+    frames = [frame for frame, _ in steps]
+    findings += [*images, check_light(frames), check_overlay(frames)]
     matches = EyeMatches.empty()
     if has_errors(images):
         # Features of such images would tell nothing, or the same once more.

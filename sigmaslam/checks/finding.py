@@ -14,6 +14,7 @@ _CAUSES_FIRST = (
     "light",
     "sharpness",
     "lines",
+    "overlay",
     "same image",
     "mirrored",
     "overlap",

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from sigmaslam.checks.finding import Finding
@@ -19,6 +20,9 @@ _MIN_CONTRAST = 10
 _WARN_BLUR = 2.0
 # Mean grey values of good pairs differ by up to 1.2 times (KITTI, EuRoC); at 3 times poses of KITTI are wrong.
 _MAX_LIGHT = 2.0
+# Grey values by which pixels of an overlay change at most, by noise and compression, and that its edges span at least;
+# the share of the pixels that are such: recordings and renders have up to 0.00024 by chance, a line of text 0.0007.
+_STILL, _EDGE, _WARN_STILL = 10, 60, 0.0005
 # Images are one and the same where they differ by less than the noise of two cameras, grey values.
 _SAME = 0.5
 EYES = ("left", "right")
@@ -73,6 +77,29 @@ def blur_radius(image: np.ndarray) -> float:
     the first derivative twice as large.
     """
     return float(1.0 / np.sqrt(8.0 * max(sharpness(image), 1e-6)))
+
+
+def check_overlay(frames: Sequence[StereoFrame]) -> Finding:
+    """Whether edges stay where they are in both images while most of the scene's move."""
+    pairs = [(frame.left, frame.right) for frame in frames]
+    if len(pairs) < 3 or len({image.shape for pair in pairs for image in pair}) > 1:
+        return Finding("overlay", "ok", "too few images of one size to tell what stays in them")
+    images, square = np.array(pairs), np.ones((3, 3), np.uint8)
+    stays = (np.ptp(images, axis=0) <= _STILL).all(axis=0)
+    for frame in frames:
+        if frame.mask is not None:
+            stays &= frame.mask > 0
+    left, right = (cv2.morphologyEx(image, cv2.MORPH_GRADIENT, square) >= _EDGE for image in images[0])
+    still = stays & left & right
+    share = float(still.mean())
+    if share <= _WARN_STILL or (left & stays).sum() > 0.5 * left.sum():
+        return Finding("overlay", "ok", f"{100 * share:.2f} % of the pixels are edges that stay in both images", share)
+    v, u = (np.percentile(each, (1, 99)).astype(int) for each in np.nonzero(still))
+    message = (
+        f"edges in columns {u[0]} to {u[1]} and rows {v[0]} to {v[1]} stay where they are while the scene moves: text, "
+        "a rim or dirt in both images, which holds poses still: leave it out with --mask"
+    )
+    return Finding("overlay", "warning", message, share)
 
 
 def check_light(frames: Sequence[StereoFrame]) -> Finding:

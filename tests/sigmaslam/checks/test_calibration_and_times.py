@@ -1,5 +1,6 @@
 """Calibrations and time stamps whose units or places are those of a mistake."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -8,9 +9,10 @@ import pytest
 
 from sigmaslam.checks.calibration import check_calibration
 from sigmaslam.checks.finding import Finding
-from sigmaslam.checks.images import blur_radius, check_images
+from sigmaslam.checks.images import blur_radius, check_images, check_overlay
 from sigmaslam.checks.time_stamps import check_time_stamps
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from tests.support.estimates import Demo
 
 GOOD = CameraModel(752, 480, 458.7, 457.3, 367.2, 248.4)
 
@@ -136,3 +138,27 @@ def test_stamps_of_a_host_are_named():
     assert finding.severity == "warning"
     assert "host stamps" in finding.message
     assert finding.figure == pytest.approx(0.01, rel=0.3)
+
+
+@pytest.mark.parametrize(("eyes", "severity"), [((), "ok"), ((0,), "ok"), ((0, 1), "warning")])
+def test_text_that_stays_in_both_images_is_named_with_its_place(demo: Demo, eyes: tuple[int, ...], severity: str):
+    frames = [replace(each, left=each.left.copy(), right=each.right.copy()) for each in demo[1][::3]]
+    for frame in frames:
+        for eye in eyes:
+            image = (frame.left, frame.right)[eye]
+            cv2.putText(image, "REC 2026-11-29", (20, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 255, 2)
+    found = check_overlay(frames)
+    assert found.severity == severity
+    if severity == "warning":
+        u0, u1, v0, v1 = map(int, re.findall(r"\d+", found.message))
+        assert (20 <= u0 < u1 <= 200, 20 <= v0 < v1 <= 45) == (True, True)
+        assert "--mask" in found.message
+    mask = np.ones(frames[0].left.shape, np.uint8)
+    mask[15:50, 15:205] = 0
+    assert check_overlay([replace(each, mask=mask) for each in frames]).severity == "ok"
+
+
+def test_a_camera_that_stands_sees_no_overlay(demo: Demo):
+    frame, rng = demo[1][0], np.random.default_rng(0)
+    noisy = np.clip(frame.left + rng.normal(0.0, 1.5, (8, *frame.left.shape)), 0, 255).astype(np.uint8)
+    assert check_overlay([replace(frame, left=each, right=each) for each in noisy]).severity == "ok"
