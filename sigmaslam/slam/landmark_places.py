@@ -27,3 +27,9 @@ def seen_from(window: KeyframeWindow, rows: np.ndarray, pose: np.ndarray) -> np.
     front = (measured[rows, 2] > 0.0) & (here[:, 2] > 0.0)
     seen = window.camera.project(np.where(front[:, None], here, [0.0, 0.0, 1.0]))
     return np.where(front[:, None], seen, np.nan)
+
+
+def seen_apart(window: KeyframeWindow, rows: np.ndarray, pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(K,) pixels between where two poses (4, 4) see landmarks; NaN of those that are behind one or far away."""
+    here, there = (seen_from(window, rows, each)[:, :2] for each in (pose, other))
+    return np.asarray(np.linalg.norm(here - there, axis=1))

@@ -21,6 +21,7 @@ from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatcher, GuidedMatches
 from sigmaslam.slam.keyframe import Keyframe
 from sigmaslam.slam.landmark_following import LandmarkFollower
+from sigmaslam.slam.landmark_places import seen_apart
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 from sigmaslam.two_view.scene_pose import is_rival
@@ -230,7 +231,7 @@ class Localiser:
     ) -> FrameFit | None:
         """The pose of what was found around `start` (4, 4), by a prediction as uncertain as it asks for.
 
-        None where what agrees with the prediction itself explains a rival's part of the image.
+        None where the prediction's pose explains a rival's part of the image beside it.
         """
         excess = surprise(self.motion, se3_inverse(self.window.posterior.poses[-1]) @ start)
         pose, covariance, least = prediction.pose, prediction.covariance, self.config.min_inliers
@@ -238,11 +239,17 @@ class Localiser:
         rival = self.update.fit(near.views, pose, covariance, least) if len(near.probability) >= least else None
         if fit is None or rival is None or rival.nis_per_dof > ACCEPTANCE.doubtful_nis:
             return fit
-        return None if is_rival(self._explained_area(near, rival), self._explained_area(matches, fit)) else fit
+        return None if is_rival(self._own_area(near, rival, fit), self._own_area(matches, fit, rival)) else fit
 
-    def _explained_area(self, matches: GuidedMatches, fit: FrameFit) -> float:
-        camera, places = self.window.camera, matches.views.measurement[:, :2]
-        return explained_area(image_cells(places, camera.width, camera.height), fit.inliers, np.ones(len(places)))
+    def _own_area(self, matches: GuidedMatches, fit: FrameFit, other: FrameFit) -> float:
+        """Share of the image that a pose explains and another one does not; 0 where that is too little for a pose.
+
+        Far landmarks agree with both and tell nothing.
+        """
+        camera, places, rows = self.window.camera, matches.views.measurement[:, :2], matches.views.landmark
+        own = fit.inliers & (seen_apart(self.window, rows, fit.pose, other.pose) >= ACCEPTANCE.same_motion)
+        cells = image_cells(places, camera.width, camera.height)
+        return explained_area(cells, own, np.ones(len(own))) if own.sum() >= self.config.min_inliers else 0.0
 
 
 def _gives_way(fit: FrameFit, alone: FrameFit) -> bool:

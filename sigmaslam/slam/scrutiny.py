@@ -17,7 +17,7 @@ from sigmaslam.slam.eye_timing import SPOILT, EyeTiming
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.frozen_images import shows_motion
 from sigmaslam.slam.guided_matching import GuidedMatches
-from sigmaslam.slam.landmark_places import seen_from
+from sigmaslam.slam.landmark_places import seen_apart
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.moving_region import MovingRegion
 from sigmaslam.slam.second_motion import SecondMotion, find_scene_behind, find_second_motion
@@ -125,8 +125,7 @@ class Scrutiny:
         rows, seen = matches.views.landmark, matches.views.measurement[:, :2]
         ids = self._window.landmarks.id[rows]
         image, pose, old_ids, old_seen = self._before or (left, fit.pose, ids, seen)
-        ways = seen_from(self._window, rows, pose)[:, :2] - seen_from(self._window, rows, fit.pose)[:, :2]
-        ways = np.linalg.norm(ways, axis=1)
+        ways = seen_apart(self._window, rows, pose, fit.pose)
         moves = ways > 3.0 * ACCEPTANCE.stands
         if self._before is None or 2 * moves.sum() > np.isfinite(ways).sum():
             _, now, then = np.intersect1d(ids, old_ids, assume_unique=True, return_indices=True)

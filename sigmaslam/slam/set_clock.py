@@ -9,7 +9,7 @@ from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.geometry.se3 import se3_exp
 from sigmaslam.slam.guided_matching import GuidedMatches
-from sigmaslam.slam.landmark_places import seen_from
+from sigmaslam.slam.landmark_places import seen_apart
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.rig_change import RigChange
 from sigmaslam.two_view.scene_pose import is_rival, see_the_same
@@ -61,5 +61,4 @@ def go_back(motion: MotionFilter, seconds: float) -> None:
 def _are_same(localiser: Localiser, matches: GuidedMatches, fit: FrameFit, other: FrameFit) -> bool:
     """Whether two poses see most landmarks of the first one at the same places."""
     rows = matches.views.landmark[fit.inliers]
-    here, there = (seen_from(localiser.window, rows, each.pose)[:, :2] for each in (fit, other))
-    return see_the_same(np.linalg.norm(here - there, axis=1))
+    return see_the_same(seen_apart(localiser.window, rows, fit.pose, other.pose))

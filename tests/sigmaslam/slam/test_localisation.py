@@ -5,10 +5,12 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from sigmaslam.slam import localisation
 from sigmaslam.slam.config import TrackerConfig
-from sigmaslam.slam.localisation import Localiser
+from sigmaslam.slam.localisation import Localiser, Prediction
 
 CONFIG = TrackerConfig(min_inliers=15)
 
@@ -33,3 +35,34 @@ def test_few_that_fit_badly_are_chance_unless_most_agree(
     _, fit = localiser.localise(nothing, [], nothing, guided=False, clock=nothing)
     assert (fit is found[1]) == is_taken
     assert is_taken or fit is None
+
+
+@pytest.mark.parametrize(
+    ("own", "is_taken"),
+    [
+        (9, True),  # a street, frames of which a counter did not count: it stayed 1.4 m behind
+        (35, False),  # the scene beside a truck
+    ],
+)
+def test_what_agrees_with_both_poses_does_not_speak_for_the_prediction(
+    monkeypatch: pytest.MonkeyPatch, own: int, is_taken: bool
+):
+    """Of 35 landmarks the prediction's pose sees all but `own` where the other pose does, too: they are far."""
+    camera = SimpleNamespace(width=400, height=200)
+
+    def found(agree: int, count: int) -> Any:
+        places = np.random.default_rng(0).uniform(0, [400, 200, 30], (count, 3))
+        views = SimpleNamespace(landmark=np.arange(count), measurement=places)
+        fit = SimpleNamespace(inliers=np.arange(count) < agree, nis_per_dof=1.5, pose=np.eye(4))
+        return SimpleNamespace(views=views, probability=np.ones(count)), fit
+
+    (matches, alone), (near, rival) = found(67, 81), found(35, 95)
+    apart = {81: np.where(np.arange(81) < 40, 20.0, 1.0), 95: np.where(np.arange(95) < own, 20.0, 1.0)}
+    monkeypatch.setattr(localisation, "seen_apart", lambda window, rows, *_: apart[len(rows)])
+    monkeypatch.setattr(localisation, "surprise", lambda *_: 300.0)
+    update: Any = SimpleNamespace(fit=lambda views, *_: alone if views is matches.views else rival)
+    window: Any = SimpleNamespace(camera=camera, posterior=SimpleNamespace(poses=np.eye(4)[None]))
+    nothing: Any = None
+    localiser = Localiser(window, nothing, update, *[nothing] * 3, CONFIG, nothing)
+    prediction = Prediction(np.eye(4), np.eye(6))
+    assert localiser._fit_alone(matches, near, prediction, np.eye(4), 1.0) is (alone if is_taken else None)
