@@ -36,6 +36,17 @@ INLINE const uint8_t* pixels_of(const Image& image, int row, int left, int count
     return buffer;
 }
 
+// Fetches the pixels around a place while another one is worked on: no processor foresees where patches lie.
+INLINE void prefetch(const Image& image, const double* place) {
+    constexpr int REACHED = 8;  // pixels
+    if (!(place[0] >= 0.0 && place[0] < image.width && place[1] >= 0.0 && place[1] < image.height)) return;
+    const int u = static_cast<int>(place[0]), v = static_cast<int>(place[1]);
+    for (int row = std::max(v - REACHED, 0); row < std::min(v + REACHED, image.height); ++row) {
+        const uint8_t* pixels = image.pixels + static_cast<size_t>(row) * image.width + u;
+        __builtin_prefetch(pixels - REACHED), __builtin_prefetch(pixels + REACHED);
+    }
+}
+
 // Gaussian weights of the pixels around a place, by its fraction of a pixel; linear in between, padded with zeros.
 struct Kernel {
     int reach, taps, padded;
@@ -163,6 +174,7 @@ py::tuple align(const std::vector<Grey>& greys0, const Steps& source, const Grey
         alignas(64) float weights[MOST_SIDE * ROW] = {0};
         window(taper, side, weights);
         for (py::ssize_t k = 0; k < count; ++k, p0 += 2, p1 += 2, A += 4, tilt += 2, place += 2) {
+            if (k + 1 < count) prefetch(images0[k + 1], p0 + 2), prefetch(image1, p1 + 2);
             place[0] = p1[0], place[1] = p1[1], moved[k] = false, correlation[k] = 0.0;
             const double zoom = A[0] * A[3] - A[1] * A[2];  // of areas
             if (!(zoom > 1.0 / MOST_ZOOM && zoom < MOST_ZOOM && shows(images0[k], p0) && shows(image1, p1))) continue;
@@ -194,9 +206,11 @@ py::array_t<double> examine(const std::vector<Grey>& greys0, const Steps& source
     py::gil_scoped_release release;
     alignas(64) float weights[MOST_SIDE * ROW] = {0};
     window(taper, side, weights);
-    for (py::ssize_t k = 0; k < count; ++k)
+    for (py::ssize_t k = 0; k < count; ++k) {
+        if (k + 1 < count) prefetch(images0[k + 1], p0 + 2 * k + 2), prefetch(image1, p1 + 2 * k + 2);
         examine_one(images0[k], image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, std::clamp(steps[k], -5, 5), side, flat,
                     weights, out + 6 * k);
+    }
     return result;
 }
 
