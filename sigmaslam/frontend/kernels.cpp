@@ -258,7 +258,7 @@ py::array_t<double> derivative_products(const Grey& grey, const Taps& taps) {
 // Points of the plane in square cells of a few each: those around a query are looked at ring by ring.
 class Plane {
 public:
-    Plane(const Places& points, int nearest) : nearest_(nearest), found_(nearest), squared_(nearest) {
+    Plane(const Places& points, int nearest) : nearest_(nearest), found_(nearest), ranked_(nearest) {
         if (points.ndim() != 2 || points.shape(1) != 2) throw std::invalid_argument("points must be (N, 2)");
         const int count = static_cast<int>(points.shape(0));
         if (nearest < 1 || nearest > count) throw std::invalid_argument("there are fewer points");
@@ -299,8 +299,10 @@ public:
                     reached = std::min(reached, low_[axis] + (at + ring + 1) * side_ - place[axis]);
             }
             reached *= 0.999f;  // rounding
-            if (reached == INFINITY || (size == nearest_ && reached > 0.f && squared_[size - 1] < reached * reached))
-                return found_.data();
+            const bool are_all = size == nearest_ && reached > 0.f && ranked_[size - 1] < rank(reached * reached, 0);
+            if (reached != INFINITY && !are_all) continue;
+            for (int k = 0; k < nearest_; ++k) found_[k] = static_cast<int>(ranked_[k] & UINT32_MAX);
+            return found_.data();
         }
     }
 
@@ -321,17 +323,25 @@ private:
     void look_at(int cell, const float* place, int& size) {
         for (int i = begin_[cell]; i < begin_[cell + 1]; ++i) {
             const float du = points_[i].u - place[0], dv = points_[i].v - place[1], square = du * du + dv * dv;
-            if (size == nearest_ && square >= squared_[size - 1]) continue;
+            const uint64_t one = rank(square, points_[i].index);
+            if (size == nearest_ && one >= ranked_[size - 1]) continue;
             int k = size < nearest_ ? size++ : size - 1;
-            for (; k > 0 && squared_[k - 1] > square; --k) squared_[k] = squared_[k - 1], found_[k] = found_[k - 1];
-            squared_[k] = square, found_[k] = points_[i].index;
+            for (; k > 0 && ranked_[k - 1] > one; --k) ranked_[k] = ranked_[k - 1];
+            ranked_[k] = one;
         }
+    }
+
+    // Squared distance and number as one: what is not negative is in the order of its bits.
+    static uint64_t rank(float square, int index) {
+        uint32_t bits;
+        std::memcpy(&bits, &square, sizeof bits);
+        return static_cast<uint64_t>(bits) << 32 | static_cast<uint32_t>(index);
     }
 
     int nearest_, cells_[2];
     float low_[2], side_;
     std::vector<int> begin_, found_;
-    std::vector<float> squared_;
+    std::vector<uint64_t> ranked_;
     std::vector<Point> points_;
 };
 
