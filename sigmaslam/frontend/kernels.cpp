@@ -36,6 +36,17 @@ INLINE const uint8_t* pixels_of(const Image& image, int row, int left, int count
     return buffer;
 }
 
+// Fetches the pixels around a place while another one is worked on: no processor foresees where patches lie.
+INLINE void prefetch(const Image& image, const double* place) {
+    constexpr int REACHED = 8;  // pixels
+    if (!(place[0] >= 0.0 && place[0] < image.width && place[1] >= 0.0 && place[1] < image.height)) return;
+    const int u = static_cast<int>(place[0]), v = static_cast<int>(place[1]);
+    for (int row = std::max(v - REACHED, 0); row < std::min(v + REACHED, image.height); ++row) {
+        const uint8_t* pixels = image.pixels + static_cast<size_t>(row) * image.width + u;
+        __builtin_prefetch(pixels - REACHED), __builtin_prefetch(pixels + REACHED);
+    }
+}
+
 // Gaussian weights of the pixels around a place, by its fraction of a pixel; linear in between, padded with zeros.
 struct Kernel {
     int reach, taps, padded;
@@ -163,6 +174,7 @@ py::tuple align(const std::vector<Grey>& greys0, const Steps& source, const Grey
         alignas(64) float weights[MOST_SIDE * ROW] = {0};
         window(taper, side, weights);
         for (py::ssize_t k = 0; k < count; ++k, p0 += 2, p1 += 2, A += 4, tilt += 2, place += 2) {
+            if (k + 1 < count) prefetch(images0[k + 1], p0 + 2), prefetch(image1, p1 + 2);
             place[0] = p1[0], place[1] = p1[1], moved[k] = false, correlation[k] = 0.0;
             const double zoom = A[0] * A[3] - A[1] * A[2];  // of areas
             if (!(zoom > 1.0 / MOST_ZOOM && zoom < MOST_ZOOM && shows(images0[k], p0) && shows(image1, p1))) continue;
@@ -194,9 +206,11 @@ py::array_t<double> examine(const std::vector<Grey>& greys0, const Steps& source
     py::gil_scoped_release release;
     alignas(64) float weights[MOST_SIDE * ROW] = {0};
     window(taper, side, weights);
-    for (py::ssize_t k = 0; k < count; ++k)
+    for (py::ssize_t k = 0; k < count; ++k) {
+        if (k + 1 < count) prefetch(images0[k + 1], p0 + 2 * k + 2), prefetch(image1, p1 + 2 * k + 2);
         examine_one(images0[k], image1, p0 + 2 * k, p1 + 2 * k, b + 4 * k, std::clamp(steps[k], -5, 5), side, flat,
                     weights, out + 6 * k);
+    }
     return result;
 }
 
@@ -244,7 +258,7 @@ py::array_t<double> derivative_products(const Grey& grey, const Taps& taps) {
 // Points of the plane in square cells of a few each: those around a query are looked at ring by ring.
 class Plane {
 public:
-    Plane(const Places& points, int nearest) : nearest_(nearest), found_(nearest), squared_(nearest) {
+    Plane(const Places& points, int nearest) : nearest_(nearest), found_(nearest), ranked_(nearest) {
         if (points.ndim() != 2 || points.shape(1) != 2) throw std::invalid_argument("points must be (N, 2)");
         const int count = static_cast<int>(points.shape(0));
         if (nearest < 1 || nearest > count) throw std::invalid_argument("there are fewer points");
@@ -285,8 +299,10 @@ public:
                     reached = std::min(reached, low_[axis] + (at + ring + 1) * side_ - place[axis]);
             }
             reached *= 0.999f;  // rounding
-            if (reached == INFINITY || (size == nearest_ && reached > 0.f && squared_[size - 1] < reached * reached))
-                return found_.data();
+            const bool are_all = size == nearest_ && reached > 0.f && ranked_[size - 1] < rank(reached * reached, 0);
+            if (reached != INFINITY && !are_all) continue;
+            for (int k = 0; k < nearest_; ++k) found_[k] = static_cast<int>(ranked_[k] & UINT32_MAX);
+            return found_.data();
         }
     }
 
@@ -307,17 +323,25 @@ private:
     void look_at(int cell, const float* place, int& size) {
         for (int i = begin_[cell]; i < begin_[cell + 1]; ++i) {
             const float du = points_[i].u - place[0], dv = points_[i].v - place[1], square = du * du + dv * dv;
-            if (size == nearest_ && square >= squared_[size - 1]) continue;
+            const uint64_t one = rank(square, points_[i].index);
+            if (size == nearest_ && one >= ranked_[size - 1]) continue;
             int k = size < nearest_ ? size++ : size - 1;
-            for (; k > 0 && squared_[k - 1] > square; --k) squared_[k] = squared_[k - 1], found_[k] = found_[k - 1];
-            squared_[k] = square, found_[k] = points_[i].index;
+            for (; k > 0 && ranked_[k - 1] > one; --k) ranked_[k] = ranked_[k - 1];
+            ranked_[k] = one;
         }
+    }
+
+    // Squared distance and number as one: what is not negative is in the order of its bits.
+    static uint64_t rank(float square, int index) {
+        uint32_t bits;
+        std::memcpy(&bits, &square, sizeof bits);
+        return static_cast<uint64_t>(bits) << 32 | static_cast<uint32_t>(index);
     }
 
     int nearest_, cells_[2];
     float low_[2], side_;
     std::vector<int> begin_, found_;
-    std::vector<float> squared_;
+    std::vector<uint64_t> ranked_;
     std::vector<Point> points_;
 };
 

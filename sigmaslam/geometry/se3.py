@@ -13,6 +13,9 @@ import numpy as np
 def skew(vectors: np.ndarray) -> np.ndarray:
     """Cross-product matrices: `skew(a) @ b == cross(a, b)`; (..., 3) -> (..., 3, 3)."""
     v = np.asarray(vectors)
+    if v.ndim == 1:  # a third of the time
+        x, y, z = v.tolist()
+        return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], v.dtype)
     matrix = np.zeros((*v.shape[:-1], 3, 3), dtype=v.dtype)
     matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
     matrix[..., 1, 0], matrix[..., 1, 2] = v[..., 2], -v[..., 0]
@@ -90,9 +93,8 @@ def rotation_exp(vectors: np.ndarray) -> np.ndarray:
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     """The rotation closest in the Frobenius norm to each matrix; (..., 3, 3) -> (..., 3, 3)."""
     u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
-    sign = np.ones((*u.shape[:-2], 3))
-    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
-    return np.asarray((u * sign[..., None, :]) @ vt)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
 
 
 def rigid_motion(rotation: np.ndarray, translation: np.ndarray | Sequence[float]) -> np.ndarray:
