@@ -24,7 +24,7 @@ from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.landmark_places import seen_apart
 from sigmaslam.slam.stopwatch import Stopwatch
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
-from sigmaslam.two_view.scene_pose import is_rival
+from sigmaslam.two_view.scene_pose import are_one_place, is_rival
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +247,8 @@ class Localiser:
         Far landmarks agree with both and tell nothing.
         """
         camera, places, rows = self.window.camera, matches.views.measurement[:, :2], matches.views.landmark
-        own = fit.inliers & (seen_apart(self.window, rows, fit.pose, other.pose) >= ACCEPTANCE.same_motion)
+        apart = seen_apart(self.window, rows, fit.pose, other.pose)
+        own = fit.inliers & np.isfinite(apart) & ~are_one_place(apart)
         cells = image_cells(places, camera.width, camera.height)
         return explained_area(cells, own, np.ones(len(own))) if own.sum() >= self.config.min_inliers else 0.0
 
