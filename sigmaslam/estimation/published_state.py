@@ -14,15 +14,19 @@ from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.window_state import WindowState, scale_considered, scale_variances
 
 
-def published_state(window: KeyframeWindow) -> WindowState:
-    """The posterior with these errors."""
-    given = window.worse, window.clustering
-    if given == (1.0, 1.0):
+def with_shown_errors(window: KeyframeWindow) -> WindowState:
+    """The posterior with errors of the calibration as large as images show, as a map keeps it for later runs."""
+    if window.worse == 1.0:
         return window.posterior
-    last = window.published
+    return scale_considered(window.posterior, _considered_growth(window))
+
+
+def published_state(window: KeyframeWindow) -> WindowState:
+    """The same with what neighbours share."""
+    given, last = (window.worse, window.clustering), window.published
     if last is None or last[0] is not window.posterior or last[1] != given:
-        state = scale_considered(window.posterior, _considered_growth(window))
-        last = window.published = window.posterior, given, scale_variances(state, window.clustering)
+        state = scale_variances(with_shown_errors(window), window.clustering)
+        last = window.published = window.posterior, given, state
     return last[2]
 
 

@@ -10,7 +10,7 @@ from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.marginalised_poses import step_between
-from sigmaslam.estimation.published_state import published_state
+from sigmaslam.estimation.published_state import published_state, with_shown_errors
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.geometry.camera import RectifiedStereo
@@ -165,7 +165,7 @@ class Keyframes:
         """All of them as arrays by name, by which a later run finds its place in the map."""
         keyframes = [*self.remembered, *self.active]
         return pack_keyframes(
-            keyframes, published_state(self._window).all_poses, frontend, camera, self.hanging.values()
+            keyframes, with_shown_errors(self._window).all_poses, frontend, camera, self.hanging.values()
         )
 
     def _remember(self, keyframes: list[Keyframe], spare: KnownKeyframe | None = None) -> None:

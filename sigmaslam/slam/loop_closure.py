@@ -8,7 +8,7 @@ import numpy as np
 
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
-from sigmaslam.estimation.published_state import published_state
+from sigmaslam.estimation.published_state import with_shown_errors
 from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.estimation.window_state import loop_difference
 from sigmaslam.geometry.se3 import se3_body, se3_inverse, turn_covariance
@@ -96,7 +96,7 @@ class LoopCloser:
 
     def _revisited(self, newest: Keyframe) -> tuple[KnownKeyframe | None, float]:
         """The keyframe of long ago that looks most like the newest, or is nearest; metres of drift since."""
-        state = published_state(self.window)  # where the rig is bad, the place is less certain
+        state = with_shown_errors(self.window)  # where the rig is bad, the place is less certain
         pose, place = state.poses[-1], pose_slice(len(state) - 1)
         sigma = np.sqrt(np.trace(se3_body(pose, state.whole_covariance[place, place])[:3, :3]))
         reach = self.window.depth + _REACH_SIGMAS * sigma
