@@ -63,10 +63,11 @@ def last_error(run: SimulatedRun) -> float:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("kind", "share"), [("driving", 0.8), ("drone", 0.4)])
-def test_a_delay_that_is_told_is_corrected(kind: str, share: float):
+@pytest.mark.parametrize("kind", ["driving", "drone"])
+def test_a_delay_that_is_told_is_corrected(kind: str):
     """By the velocity as it was predicted, which here wanders from frame to frame by half of what is allowed."""
-    late, told = ([run(kind, seed, is_told=is_told) for seed in range(3)] for is_told in (False, True))
-    assert np.mean([last_error(each) for each in told]) < share * np.mean([last_error(each) for each in late])
-    assert np.mean([each.nees.mean() for each in late]) > 2.0 > np.mean([each.nees.mean() for each in told])
+    late, told = ([run(kind, seed, is_told=is_told) for seed in range(6)] for is_told in (False, True))
+    assert np.mean([last_error(each) for each in told]) < 0.4 * np.mean([last_error(each) for each in late])
+    assert np.mean([each.nees.mean() for each in late]) > 4.0
+    assert np.mean([each.nees.mean() for each in told]) < 2.0
     assert all(e.status == "tracking" for each in told for e in each.estimates[1:])
