@@ -39,6 +39,7 @@ class Finding:
         message: one line; names the value, and for warnings and errors the cure.
         figure: the value that was judged, None where there is none.
         pixels: by how much disparities may be off for it; None where that is not known.
+        delay: seconds by which right images are late, if that is what is wrong, and part of a frame.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Finding:
     message: str
     figure: float | None = None
     pixels: float | None = None
+    delay: float = 0.0
 
 
 # Faults that bend disparities, and by how many pixels where the check does not tell: what is searched across rows.

@@ -22,6 +22,8 @@ _MAX_BEHIND, _WARN_BEHIND = 0.1, 0.02
 _EXPLAINED, _BETTER = 0.5, 2.0
 # A delay that moves the median place by less than this is within the noise of a match, pixels.
 _WARN_LAG = 0.5
+# Many matches share it: far places, which are most, hide what near ones show.
+_LEAST_LAG = 0.1
 # And one that explains a smaller share of the variance of rows than this may stand for something else.
 _LAG_SHARE = 1 / 3
 # Rows in the stored images agree within this if these are rectified already, pixels.
@@ -156,7 +158,7 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
     sigma = float(fit.sigmas[4])
     figure = f"{abs(fit.lag):.2f} ± {sigma:.2f} of a frame{_milliseconds(fit.lag, frame_interval)}"
     explained = _mad(fit.residual) ** 2 < (1.0 - _LAG_SHARE) * _mad(fit.residual + fit.by_lag[:, 1]) ** 2
-    if fit.lag_shift < _WARN_LAG or not explained:
+    if fit.lag_shift < _LEAST_LAG or not explained:
         return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
     message = (
         f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "
@@ -168,6 +170,7 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
         message,
         fit.lag,
         fit.lag_shift,
+        fit.lag * (frame_interval or 0.0),
     )
 
 

@@ -135,8 +135,8 @@ def _main_verdict(
     delays = [each.message for each in faults if each.name == "synchronisation"]
     if delays:
         return (
-            f"Nothing can be said about the calibration, as the eyes are not synchronised: {delays[0]}. Depth and "
-            "poses are wrong while the camera moves."
+            f"Nothing can be said about the calibration, as the eyes are not synchronised: {delays[0]}. Depth is wrong "
+            "while the camera moves; poses are corrected for a delay of a part of a frame alone."
         )
     causes = [each.message for each in faults if each.name in _RIG]
     causes += [_describe_cause(name, *each) for name, each in calibration.causes.items() if name in _CAUSES]

@@ -15,7 +15,7 @@ from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
 from sigmaslam.calibration.learned_calibration import learned_calibration
 from sigmaslam.calibration_files.calibration_writer import write_calibration
-from sigmaslam.checks.finding import disparity_error
+from sigmaslam.checks.finding import Finding, disparity_error
 from sigmaslam.checks.inertial_agreement import judge_motion
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
@@ -60,8 +60,8 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
     if request.outputs.resume:
         stopped = read_stopped_run(out, settings)
         stopped.check_sequence(sequence)
-    pixels = disparity_error(request.input.findings)
-    tracker = _build_tracker(sequence, options, None if stopped is None else stopped.start, pixels)
+    start = None if stopped is None else stopped.start
+    tracker = _build_tracker(sequence, options, start, request.input.findings)
     location = None
     if options.location is not None:
         location = LocationFilter(options.location, options.track_object is not None)
@@ -159,16 +159,16 @@ def _describe_end(stopped_by: BaseException | None) -> str:
 
 
 def _build_tracker(
-    sequence: StereoSequence, options: TrackerOptions, start: StartPose | None, pixels: float | None
+    sequence: StereoSequence, options: TrackerOptions, start: StartPose | None, findings: Sequence[Finding]
 ) -> Tracker:
     camera, frontend, backend, config = sequence.camera, options.frontend, options.backend, options.config
     threads, provider, weights = options.threads, options.provider, options.weights
     if options.track_object is None:
         imu = None if sequence.imu is None else sequence.imu.sensor
         odometry = None if sequence.odometry is None else sequence.odometry.sensor
-        return StereoTracker(
-            camera, frontend, backend, config, None, threads, start, provider, weights, pixels, imu, odometry
-        )
+        pixels, delay = disparity_error(findings), sum(each.delay for each in findings)
+        images, rig = (frontend, backend, config, None, threads), (pixels, imu, odometry, delay)
+        return StereoTracker(camera, *images, start, provider, weights, *rig)
     region = read_region(options.track_object, camera.left.width, camera.left.height)
     return ObjectTracker(camera, region, frontend, backend, config, threads, provider, weights)
 

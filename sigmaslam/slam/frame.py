@@ -10,8 +10,10 @@ import numpy as np
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.frontend import Frontend, StereoView
 from sigmaslam.frontend.motion_blur import is_blurred
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.argument_checks import check_mask
+from sigmaslam.slam.late_eye import at_one_moment
 
 # Patches have a radius of so many pixels: nearer to what is masked they show some of it.
 _MARGIN = 5
@@ -24,6 +26,7 @@ class Frame:
         left, right: (H, W) uint8, rectified.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
         exchanged: gives left and right as they are if each image is the other eye's; by default as they are here.
+        late: the rectified pair, and the way (6,) of `at_one_moment`; None: there is none.
     """
 
     def __init__(
@@ -33,8 +36,9 @@ class Frame:
         frontend: Frontend,
         usable: np.ndarray | None = None,
         exchanged: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None,
+        late: tuple[RectifiedStereo, np.ndarray] | None = None,
     ) -> None:
-        self._observe, self._exchanged = frontend.observe, exchanged or (lambda: (right, left))
+        self._observe, self._exchanged, self._late = frontend.observe, exchanged or (lambda: (right, left)), late
         self.left = left
         self.right = right
         self.usable = usable
@@ -47,7 +51,8 @@ class Frame:
     @cached_property
     def view(self) -> StereoView:
         """The pair with its features and their disparities."""
-        return replace(self._observe(self.left, self.right).within(self.usable), is_blurred=self.is_blurred)
+        view = replace(self._observe(self.left, self.right).within(self.usable), is_blurred=self.is_blurred)
+        return view if self._late is None else at_one_moment(view, *self._late)
 
     def is_exchanged(self, last: StereoView, min_to_judge: int) -> bool:
         """Whether each image is the other eye's: hardly a disparity as they are, and many the other way round.

@@ -65,6 +65,8 @@ class GuidedMatcher:
         window: whose landmarks are searched for.
         update: predicts them.
         noise: of what is matched.
+        in_stereo: views have disparities. Those of a late eye would hold errors of the velocity that poses tell, and
+            come back larger.
     """
 
     camera: RectifiedStereo
@@ -73,6 +75,7 @@ class GuidedMatcher:
     update: FrameUpdate
     noise: MeasurementNoise
     config: TrackerConfig
+    in_stereo: bool = True
 
     def match_guided(
         self,
@@ -199,7 +202,8 @@ class GuidedMatcher:
                 streaked = True
         if not alone:
             noise, common = self.noise.split(noise)
-        views = LandmarkViews(np.concatenate(landmarks), matches.measured, noise, common)
+        measured = matches.measured if self.in_stereo else np.insert(matches.points, 2, np.nan, axis=1)
+        views = LandmarkViews(np.concatenate(landmarks), measured, noise, common)
         return GuidedMatches(views, matches.probability, np.concatenate([rows for rows, _, _ in parts]), streaked)
 
 

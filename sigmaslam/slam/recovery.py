@@ -10,15 +10,18 @@ from sigmaslam.estimation.calibration_correction import change_rig
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
-from sigmaslam.geometry.se3 import se3_body, turn_covariance
+from sigmaslam.geometry.se3 import se3_body, se3_log, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
+from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
+from sigmaslam.slam.late_eye import at_one_moment
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks, Mapper, NewKeyframe
 from sigmaslam.slam.phase import Course, Phase
 from sigmaslam.slam.relocalisation import Relocalisation
 from sigmaslam.slam.rig_change import RigChange
+from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -118,6 +121,16 @@ class Recovery:
         if had_moved:
             course.resume(started_at)
         self.motion.predict(timestamp - started_at, self.config.densities(self.window.depth), timestamp=timestamp)
+
+    def begin_late(self, frame: Frame, matcher: UnguidedMatcher, delay: float, timestamp: float) -> None:
+        """Starts again from a first view whose right image came a delay later, if this frame shows the velocity."""
+        first, camera = self.keyframes.active[0].view, self.window.camera
+        if self.motion.twist.any() or (relative := matcher.relative_pose_to(first, frame.view)) is None:
+            return
+        twist = se3_log(relative.T_key_camera) / (timestamp - self.course.started_at)
+        frame.view = at_one_moment(frame.view, camera, delay * twist)
+        self.begin_again(at_one_moment(first, camera, delay * twist), timestamp)
+        self.motion.set_twist(twist, self.config.initial_twist_sigma(self.window.depth))
 
     def _start(self, view: StereoView, timestamp: float) -> KeyframeTracks:
         """Makes the view the first keyframe, and its camera the world where no other one is given."""

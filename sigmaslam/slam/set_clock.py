@@ -23,19 +23,19 @@ def by_times(localiser: Localiser, localise: Callable[[], Found]) -> Found:
     The pose that more matches agree with, and the motion that led there, are kept; where both are the same, the motion
     that is closer. The other pose is kept beside it where it is a rival. Without a pose the motion spans both times.
     """
-    motion, late = localiser.motion, localiser.frame_clock.late
+    motion, window, late = localiser.motion, localiser.window, localiser.frame_clock.late
     matches, fit, change = localise()
-    if late == 0.0 or change is not None or dead_reckoning(motion) is not None or not len(localiser.window):
+    if late == 0.0 or change is not None or dead_reckoning(motion) is not None or not len(window):
         return matches, fit, change
     as_stamped = motion.state, motion.widened
     go_back(motion, 0.0)
-    prediction = Prediction.of(localiser.window, motion)
+    prediction = Prediction.of(window, motion)
     go_back(motion, late)
-    earlier = Prediction.of(localiser.window, motion)
+    earlier = Prediction.of(window, motion)
     others, other, _ = localise()
     if fit is None or other is None:
         is_same, goes_back = False, fit is None and other is not None
-    elif is_same := _are_same(localiser, matches, fit, other):
+    elif is_same := see_the_same(seen_apart(window, matches.views.landmark[fit.inliers], fit.pose, other.pose)):
         goes_back = earlier.squared_departure(other.pose) < prediction.squared_departure(fit.pose)
     else:
         goes_back = other.count > fit.count
@@ -56,9 +56,3 @@ def go_back(motion: MotionFilter, seconds: float) -> None:
     """Predicts an earlier moment, no more certain than the later one, and no longer widened."""
     motion.widen(1.0 / motion.widened)
     motion.step = se3_exp(-motion.way(seconds)) @ motion.step
-
-
-def _are_same(localiser: Localiser, matches: GuidedMatches, fit: FrameFit, other: FrameFit) -> bool:
-    """Whether two poses see most landmarks of the first one at the same places."""
-    rows = matches.views.landmark[fit.inliers]
-    return see_the_same(seen_apart(localiser.window, rows, fit.pose, other.pose))

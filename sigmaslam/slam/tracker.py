@@ -72,15 +72,13 @@ class StereoTracker:
         backend: "onnx", or "torch" (needs the extra `train`).
         admission: what may become a landmark; by default everything.
         threads: of the network.
-        start: pose of the first frame in the world of an earlier run, in which it was a keyframe; by default the left
-            camera of the first frame is the world.
+        start: pose of the first frame, a keyframe of an earlier run, in its world; by default that frame is the world.
         provider: where ONNX Runtime computes the networks, "cpu", "cuda" or "openvino"; the estimator stays on the CPU.
-        weights: folder of networks of one's own, as `sigmaslam train export` writes it; for those that it lacks,
-            the ones that ship.
-        disparity_error: pixels by which disparities may be off, as a check found that the eyes do not fit: all poses
-            are doubtful then, and less certain; None: nothing was found.
+        weights: folder of one's own networks, as `sigmaslam train export` writes it, before those that ship.
+        disparity_error: pixels by which a check found disparities to be off: poses are doubtful, and less certain.
         imu: an inertial sensor on the rig, whose samples `add_imu` takes.
         odometry: wheels under the rig, whose samples `add_odometry` takes.
+        right_delay: seconds by which right images are taken later than left ones; disparities are corrected for it.
 
     Attributes:
         rectifier: of the images that are tracked.
@@ -104,9 +102,10 @@ class StereoTracker:
         disparity_error: float | None = None,
         imu: InertialSensor | None = None,
         odometry: OdometrySensor | None = None,
+        right_delay: float = 0.0,
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights)
-        self._turn, self.config = Lock(), (config := config or TrackerConfig())
+        self._turn, self._delay, self.config = Lock(), right_delay, (config := config or TrackerConfig())
         networks = config.max_keypoints, backend, threads, provider, weights
         load: Callable[[], Frontend] = partial(build_frontend, frontend, *networks)
         if threads > 1:  # beside all else that a start needs
@@ -129,7 +128,7 @@ class StereoTracker:
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
         self._frontend = frontend = load()
         update = FrameUpdate(window, config.iterations, bool(motion.sensors))
-        guided = GuidedMatcher(rectified, frontend, window, update, noise, config)
+        guided = GuidedMatcher(rectified, frontend, window, update, noise, config, not right_delay)
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
         self._follower = follower = LandmarkFollower(guided)
         self._localiser = localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
@@ -188,7 +187,8 @@ class StereoTracker:
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
         exchanged = partial(self.rectifier.rectify, right, left)
-        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable, exchanged)
+        late = (self._camera, self._delay * self._motion.twist) if self._delay else None
+        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable, exchanged, late)
         clock.lap("rectify")
         if self._course.timestamp is not None:
             seconds, sigma, stretch = self._clock.tick(timestamp - self._course.timestamp)
@@ -265,6 +265,8 @@ class StereoTracker:
             return GuidedMatches.empty(), None, None
         if (first := self._admission.begin_again(frame, self._unguided)) is not None:
             self._recovery.begin_again(first, timestamp)
+        if self._delay and self._course.phase is Phase.STARTING:
+            self._recovery.begin_late(frame, self._unguided, self._delay, timestamp)
         prediction = Prediction.of(self._window, self._motion)
         guided = self._course.phase is Phase.TRACKING
         if guided and self._follower.is_ready:

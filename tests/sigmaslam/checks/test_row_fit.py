@@ -113,6 +113,13 @@ def test_a_part_of_a_frame_between_the_eyes_is_measured():
     assert {found[name][0] for name in ("rows", "rotation", "scale", "infinity")} == {"unknown"}
 
 
+def test_a_delay_of_a_few_milliseconds_is_told_in_seconds():
+    found = {each.name: each for each in check_rig(matches_of(lag=0.1), StereoRectifier(camera()), 0.1)}
+    assert found["synchronisation"].severity == "warning"
+    assert found["synchronisation"].delay == pytest.approx(0.01, abs=0.001)
+    assert found["eyes"].delay == 0.0
+
+
 def test_a_bump_between_two_pairs_is_no_delay():
     matches = matches_of()
     matches.right[matches.pair == 0, 1] += 3.0
