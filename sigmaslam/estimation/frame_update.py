@@ -15,6 +15,7 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.state_layout import CALIBRATION, LANDMARK_SIZE, pose_slice
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
+from sigmaslam.table import distinct
 
 # Linearisations with a gate, which must agree twice or give way to the last.
 _GATED = 3
@@ -157,7 +158,7 @@ class FrameUpdate:
             # The frame's pose moves no landmark; a solution ends with another state.
             padded = np.pad(landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
             self._padded = state, landmarks.dependence, padded
-        anchors, pair = np.unique(landmarks.anchor[rows], return_inverse=True)
+        anchors, pair = distinct(landmarks.anchor[rows])
         is_compiled, dependence = window.graphs.is_compiled, self._padded[2]
         return {
             **window.graphs.constants(window.depth),
