@@ -15,9 +15,13 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.state_layout import CALIBRATION, LANDMARK_SIZE, pose_slice
 from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, se3_log
+from sigmaslam.table import distinct
 
 # Linearisations with a gate, which must agree twice or give way to the last.
 _GATED = 3
+
+# Where views are linearised: (n,) and (n, n) of the state, and (M, 6) how landmarks moved.
+_POINT = "offset", "spread", "moved"
 
 
 class FrameUpdate:
@@ -88,39 +92,14 @@ class FrameUpdate:
             spread = replace_part(spread, frame, last)
         # Landmarks are estimated along with the pose: measured places and depths in the role of true ones would
         # draw the pose towards no motion.
-        moved = np.zeros((len(views), LANDMARK_SIZE))
-        measured = {"measurement": views.measurement, "noise": views.noise}
+        at = {"offset": offset, "spread": spread, "moved": np.zeros((len(views), LANDMARK_SIZE))}
         known = self._views(views.landmark, views.common, pose, factor)
-
-        for iteration in range(self._iterations):
-            gated = np.array(float(iteration == 0 and start is None))
-            at = {"offset": offset, "spread": spread, "moved": moved, "gated": gated, "scale": np.array(scale)}
-            offset, spread, moved, usable = self._window.graphs.robust_step({**measured, **at, **known})
-            if usable < min_inliers:
-                return None
-
-        inliers: np.ndarray | None = None
-        noise_scale = np.array(0.0)  # the first step finds it: before the gate, which would hide how far they scatter
-        prior = np.concatenate([posterior.common, posterior.common[last]])
-        freedom = np.array(self._window.student_freedom)
-        for iteration in range(_GATED):
-            at = {"offset": offset, "spread": spread, "moved": moved, "noise_scale": noise_scale}
-            at |= {"scale": np.array(scale), "freedom": freedom, "prior": prior}
-            if inliers is not None and self._window.graphs.is_compiled:
-                at["inliers"] = inliers
-            agree, count, usable, squared, noise_scale, *step = self._window.graphs.gated_step(
-                {**measured, **at, **known}
-            )
-            if iteration == _GATED - 1 or (inliers is not None and (agree == inliers).all()):
-                break
-            inliers = agree
-            if usable < min_inliers or count < min_inliers:
-                return None
-            offset, spread, moved, common, information, scores, score, prior_cost = step
-        assert inliers is not None
-        inliers = inliers & agree
-        if inliers.sum() < min_inliers:
+        known |= {"measurement": views.measurement, "noise": views.noise, "scale": np.array(scale)}
+        robust = self._step_robustly(known, at, start is None, min_inliers)
+        found = None if robust is None else self._step_gated(known, robust, min_inliers)
+        if found is None:
             return None
+        inliers, squared, noise_scale, (offset, spread, _, common, information, scores, score, prior_cost) = found
         cross, size = spread[frame, last], (self._window.camera.width, self._window.camera.height)
         return FrameFit(
             nearest_rigid(se3_exp(offset[frame]) @ pose),
@@ -136,6 +115,41 @@ class FrameUpdate:
             clustering(views.measurement[:, :2], size, scores, information[frame, frame]),
             scores,
         )
+
+    def _step_robustly(
+        self, known: dict[str, np.ndarray], at: dict[str, np.ndarray], gates_prior: bool, min_inliers: int
+    ) -> dict[str, np.ndarray] | None:
+        """Where linearisations with a robust loss lead, the first one gated against the prior if told so."""
+        for iteration in range(self._iterations):
+            gated = np.array(float(iteration == 0 and gates_prior))
+            *point, usable = self._window.graphs.robust_step({**known, **at, "gated": gated})
+            if usable < min_inliers:
+                return None
+            at = dict(zip(_POINT, point, strict=True))
+        return at
+
+    def _step_gated(
+        self, known: dict[str, np.ndarray], at: dict[str, np.ndarray], min_inliers: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]] | None:
+        """The same with a gate: inliers (M,), squared residuals (M,), the scale of the noise, and the last solution."""
+        common, freedom = self._window.posterior.common, np.array(self._window.student_freedom)
+        known = {**known, "freedom": freedom, "prior": np.concatenate([common, common[-6:]])}
+        inliers: np.ndarray | None = None
+        noise_scale = np.array(0.0)  # the first step finds it: before the gate, which would hide how far they scatter
+        for iteration in range(_GATED):
+            feed = {**known, **at, "noise_scale": noise_scale}
+            if inliers is not None and self._window.graphs.is_compiled:
+                feed["inliers"] = inliers
+            agree, count, usable, squared, noise_scale, *step = self._window.graphs.gated_step(feed)
+            if iteration == _GATED - 1 or (inliers is not None and (agree == inliers).all()):
+                break
+            inliers, solution = agree, step
+            if usable < min_inliers or count < min_inliers:
+                return None
+            at = dict(zip(_POINT, solution, strict=False))
+        assert inliers is not None
+        inliers = inliers & agree
+        return None if inliers.sum() < min_inliers else (inliers, squared, noise_scale, solution)
 
     def _prior_factor(self, step_covariance: np.ndarray, reference: int) -> np.ndarray:
         """Factor (n, k) of the covariance of window and frame, which moves on from a keyframe."""
@@ -157,7 +171,7 @@ class FrameUpdate:
             # The frame's pose moves no landmark; a solution ends with another state.
             padded = np.pad(landmarks.dependence, ((0, 0), (0, 0), (0, 6)))
             self._padded = state, landmarks.dependence, padded
-        anchors, pair = np.unique(landmarks.anchor[rows], return_inverse=True)
+        anchors, pair = distinct(landmarks.anchor[rows])
         is_compiled, dependence = window.graphs.is_compiled, self._padded[2]
         return {
             **window.graphs.constants(window.depth),

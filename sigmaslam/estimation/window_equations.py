@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sigmaslam.estimation.landmark_table import KeyframeViews
+from sigmaslam.table import distinct
 
 if TYPE_CHECKING:
     from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -20,7 +21,7 @@ def eliminate_landmarks(
         their best places if it stays, or nothing where there are none.
     """
     size = len(window.posterior.covariance)
-    rows, owner = np.unique(observations.views.landmark, return_inverse=True)
+    rows, owner = distinct(observations.views.landmark)
     if not len(rows):  # the graph takes no empty batch
         return np.zeros((size, size)), np.zeros(size), rows, []
     landmarks, freedom = window.landmarks, np.array(window.student_freedom)
@@ -32,7 +33,7 @@ def eliminate_landmarks(
 
 def gate_views(window: "KeyframeWindow", observations: KeyframeViews) -> np.ndarray:
     """(O,) bool: which views fit the posterior (99.9 %)."""
-    rows, owner = np.unique(observations.views.landmark, return_inverse=True)
+    rows, owner = distinct(observations.views.landmark)
     if not len(rows):
         return np.zeros(0, bool)
     return window.graphs.gate_window(_views(window, observations, rows, owner))[0]
@@ -47,7 +48,7 @@ def _views(
     """
     state, landmarks, views = window.posterior, window.landmarks, observations.views
     anchor = landmarks.anchor[views.landmark]
-    pairs, pair = np.unique(anchor * len(state) + observations.keyframe, return_inverse=True)
+    pairs, pair = distinct(anchor * len(state) + observations.keyframe)
     return {
         **window.graphs.constants(window.depth),
         "anchors": pairs // len(state),

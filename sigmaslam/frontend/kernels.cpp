@@ -78,7 +78,7 @@ const Kernel& kernel(int half_octave) {
     return all[half_octave];
 }
 
-constexpr double LEVEL[2] = {0.0, 0.0};
+constexpr double SAME[4] = {1.0, 0.0, 0.0, 1.0}, LEVEL[2] = {0.0, 0.0};  // a map that changes nothing
 
 // Gaussian window of sum 1, standard deviation in samples.
 void window(double sigma, int side, float* out) {
