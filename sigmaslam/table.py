@@ -1,4 +1,4 @@
-"""Dataclasses whose fields are columns of equal length."""
+"""Dataclasses whose fields are columns of equal length, and rows of columns."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
@@ -37,6 +37,13 @@ class Table:
 def even_rows(count: int, most: int) -> np.ndarray:
     """Indices of an even selection of at most so many of `count` rows, the first and the last included."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.int64))
+
+
+def nearest_rows(values: np.ndarray, ordered: np.ndarray) -> np.ndarray:
+    """(N,) index of the nearest of increasing numbers (M,) for each value (N,); of two as near the first."""
+    after = np.clip(np.searchsorted(ordered, values), 0, len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(ordered[before] - values) <= np.abs(ordered[after] - values), before, after)
 
 
 def _select(column: Any, index: np.ndarray) -> Any:

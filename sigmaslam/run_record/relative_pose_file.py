@@ -10,7 +10,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_bytes
 from sigmaslam.run_record.appended_file import AppendedFile, pack_rows, read_rows
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
-from sigmaslam.table import Table
+from sigmaslam.table import Table, nearest_rows
 
 RELATIVE_POSES_NAME = "relative_poses.npz"
 PARTIAL_RELATIVE_POSES = "relative_poses.partial"
@@ -52,7 +52,7 @@ def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
     known = columns[0] < len(timestamps)
     later, span, earlier_time, pose, covariance = (column[known] for column in columns)
     # The nearest: time stamps that were read from trajectory.tum are rounded.
-    earlier = np.searchsorted(0.5 * (timestamps[1:] + timestamps[:-1]), earlier_time)
+    earlier = nearest_rows(earlier_time, timestamps)
     return FramePairs(np.array(SPANS)[span.astype(np.int64)], earlier, later.astype(np.int64), pose, covariance)
 
 
