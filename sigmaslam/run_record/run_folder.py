@@ -1,7 +1,6 @@
 """The folder of a run: what is known of each frame is written there as it comes."""
 
 import hashlib
-import json
 import os
 import platform
 import shlex
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, check_new_folder, csv_text, printable, save_arrays, write_ply
+from sigmaslam.files import atomic_write_json, check_new_folder, csv_text, printable, save_arrays, write_ply
 from sigmaslam.frontend.build import own_networks
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -75,7 +74,7 @@ class RunWriter:
         self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
-            atomic_write_text(out / RUN_NAME, json.dumps({**self.run, "ended": UNFINISHED}, indent=2) + "\n")
+            atomic_write_json(out / RUN_NAME, {**self.run, "ended": UNFINISHED})
             self._poses = PoseWriter(out, goes_on)
             self._relative_poses = RelativePoseWriter(out, goes_on)
             self._table = AppendedFile(out / FRAMES_NAME, goes_on)
