@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import os
 import re
 import secrets
@@ -102,6 +103,11 @@ def atomic_write_text(path: str | Path, text: str) -> None:
     with atomic_path(path) as temporary:
         # Names of files may have bytes that are no UTF-8, which Python keeps as lone surrogates.
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def atomic_write_json(path: str | Path, content: dict[str, Any]) -> None:
+    """Write entries as JSON that people can read; see `atomic_path`."""
+    atomic_write_text(path, json.dumps(content, indent=2) + "\n")
 
 
 def save_arrays(path: str | Path, **arrays: Any) -> None:

@@ -1,4 +1,4 @@
-"""Dataclasses whose fields are columns of equal length."""
+"""Dataclasses whose fields are columns of equal length, and rows of columns."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
@@ -43,6 +43,13 @@ def distinct(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The distinct ones of small integers (N,) from zero on, and (N,) which of them each is: a fast `np.unique`."""
     present = np.bincount(numbers) > 0
     return np.flatnonzero(present), (np.cumsum(present) - 1)[numbers]
+
+
+def nearest_rows(values: np.ndarray, ordered: np.ndarray) -> np.ndarray:
+    """(N,) index of the nearest of increasing numbers (M,) for each value (N,); of two as near the first."""
+    after = np.clip(np.searchsorted(ordered, values), 0, len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(ordered[before] - values) <= np.abs(ordered[after] - values), before, after)
 
 
 def _select(column: Any, index: np.ndarray) -> Any:

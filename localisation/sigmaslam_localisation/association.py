@@ -114,7 +114,7 @@ class Association:
 
     def __init__(self, name: FilterName, robot: WheeledRobot, places: Tensor | None, start: Tensor, steps: Steps):
         """With the places (M, 2) of the landmarks, or None, and the first poses (B, 3)."""
-        self._name, self._robot, self._places, self._steps = name, robot, places, steps
+        self._robot, self._places, self._steps = robot, places, steps
         self.found = np.full(steps.landmark.shape, NOBODY)
         self.count = np.full(len(start), 0 if places is None else len(places))
         self._belief = robot.prior(start)

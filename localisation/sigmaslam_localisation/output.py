@@ -1,13 +1,12 @@
 """Files that a localisation leaves: trajectories, innovations, a summary, a map and a report."""
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from sigmaslam.files import atomic_path, atomic_write_text
+from sigmaslam.files import atomic_path, atomic_write_json
 from sigmaslam_localisation.localisation_page import draw_robots, write_page
 from sigmaslam_localisation.recording import Recording
 from sigmaslam_localisation.robots import RobotEstimate
@@ -49,7 +48,7 @@ def write_run(
             scores = {each.name: score(each) for each in estimates}
             later[kind] = {each: {k: found[k] for k in ERRORS if k in found} for each, found in scores.items()}
     run = {**settings, "robots": summaries, "first_pass": at_first, **later}
-    atomic_write_text(folder / "run.json", json.dumps(run, indent=2) + "\n")
+    atomic_write_json(folder / "run.json", run)
     for kind, errors in later.items():
         for each, found in errors.items():
             summaries[each] |= {f"{kind}_{label}": value for label, value in found.items()}

@@ -1,6 +1,5 @@
 """The trained networks: read from their weights, and exported to ONNX."""
 
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_bytes, atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_bytes, atomic_write_json, atomic_write_text, make_folder
 from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.inference.weight_manifest import check_weights, update_manifest
 from sigmaslam_models.extractor import BLOBS, EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
@@ -78,7 +77,7 @@ def export_scoring(run: Path, out: Path) -> dict[str, float]:
     }
     for name in graphs:
         atomic_write_bytes(out / f"{name}.safetensors", (run / f"{name}.safetensors").read_bytes())
-    atomic_write_text(out / "matching.json", json.dumps(content, indent=2) + "\n")
+    atomic_write_json(out / "matching.json", content)
     atomic_write_text(out / "matching.md", scoring_page(content))
     update_manifest(out, [f"{name}{suffix}" for name in graphs for suffix in (".onnx", ".safetensors")])
     return differences

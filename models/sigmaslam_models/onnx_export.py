@@ -1,10 +1,9 @@
 """What a training run exports, and the graphs of a folder compared with torch."""
 
-import json
 from pathlib import Path
 
 from sigmaslam.errors import InputError, SigmaSlamError
-from sigmaslam.files import atomic_write_bytes, atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_bytes, atomic_write_json, atomic_write_text, make_folder
 from sigmaslam.inference.weight_manifest import update_manifest
 from sigmaslam_models.estimator.estimator_export import ESTIMATOR_TOLERANCE, estimator_graphs
 from sigmaslam_models.graph_export import graph_difference, relative_difference
@@ -31,7 +30,7 @@ def export_run(
     make_folder(out)
     content["onnx_minus_torch"] = {"features": export_features(weights, out / "features.onnx")}
     atomic_write_bytes(out / "features.safetensors", weights.read_bytes())
-    atomic_write_text(out / "features.json", json.dumps(content, indent=2) + "\n")
+    atomic_write_json(out / "features.json", content)
     atomic_write_text(out / "features.md", card_page(content))
     update_manifest(out, ["features.safetensors", "features.onnx"])
     return content["onnx_minus_torch"]

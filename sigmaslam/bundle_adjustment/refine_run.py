@@ -1,6 +1,5 @@
 """Refining a run folder into another one."""
 
-import json
 import logging
 import time
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from sigmaslam.bundle_adjustment.adjustment import Adjustment, RefineConfig, adj
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam
 from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, read_tracks
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, check_new_folder, make_folder, save_array, save_arrays
+from sigmaslam.files import atomic_write_json, check_new_folder, make_folder, save_array, save_arrays
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
@@ -71,9 +70,8 @@ def refine_run(run: Path, out: Path, tell: Callable[[str], None] = lambda note: 
         "versions": describe_versions("sigmaslam", "numpy", "gtsam"),
     }
     _write(out, trajectory, adjustment)
-    content = json.dumps(summary, indent=2) + "\n"
-    atomic_write_text(out / REFINE_NAME, content)
-    _add_to_report(run, out, content)
+    atomic_write_json(out / REFINE_NAME, summary)
+    _add_to_report(run, out, summary)
     return summary
 
 
@@ -118,10 +116,10 @@ def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
     write_map_points(out / "map.ply", point_map)
 
 
-def _add_to_report(run: Path, out: Path, content: str) -> None:
+def _add_to_report(run: Path, out: Path, summary: dict[str, Any]) -> None:
     """Leaves what was refined in the folder of the run, too, and writes its report anew."""
     try:
-        atomic_write_text(run / REFINE_NAME, content)
+        atomic_write_json(run / REFINE_NAME, summary)
         write_tum(run / REFINED_TRAJECTORY, read_tum(out / "trajectory.tum"))
         if (run / FRAMES_NAME).is_file():
             write_report(run)

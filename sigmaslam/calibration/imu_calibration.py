@@ -26,7 +26,7 @@ NAMES = ("delay", *(f"{part}_{axis}" for part in ("rotation", "lever") for axis 
 """Of the calibration: seconds; radians, of T_cam_imu from the right; metres."""
 MAX_ROUNDS = 25
 # Of an image: pose, velocity, biases; of all: the above and gravity.
-_POSE, _SPEED, _GYRO_BIAS, _ACCEL_BIAS, _SIZE = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15
+_POSE, _SPEED, _BIASES, _SIZE = slice(0, 6), slice(6, 9), slice(9, 15), 15
 _DELAY, _ROTATION, _LEVER, _GRAVITY, _COMMON = 0, slice(1, 4), slice(4, 7), slice(7, 10), 10
 # Prior standard deviations: an accelerometer's bias (data sheets: 0.02 to 0.5 m/s^2), a gyro's, rad/s, and by how much
 # gravity's length, with the scale error of an accelerometer, differs from the standard one, m/s^2.
@@ -106,7 +106,7 @@ class _State:
         return _State(
             self.poses @ se3_exp(steps[:, _POSE]),
             self.speeds + steps[:, _SPEED],
-            self.biases + steps[:, 9:],
+            self.biases + steps[:, _BIASES],
             T,
             self.gravity + shared[_GRAVITY],
             self.shift + float(shared[_DELAY]),
@@ -182,7 +182,7 @@ def calibrate_imu(
         replace(sensor, T_left_imu=state.T_left_imu, time_shift=state.shift),
         joint[: len(NAMES), : len(NAMES)],
         state.biases[-1],
-        last[9:, 9:],
+        last[_BIASES, _BIASES],
         state.gravity,
         float(np.sqrt(np.linalg.eigvalsh(of_gravity)[-1])),
         np.sqrt(scales),
@@ -246,11 +246,11 @@ def _factors(
         J[:, _POSE] = root
         factors.append(Factor(k, residual, J, None, None, ((0, slice(0, 6)),)))
     prior = np.zeros((6, _SIZE))
-    prior[:, 9:] = np.diag(1.0 / np.repeat([_PRIOR_GYRO, _PRIOR_ACCEL], 3))
+    prior[:, _BIASES] = np.diag(1.0 / np.repeat([_PRIOR_GYRO, _PRIOR_ACCEL], 3))
     length = float(np.linalg.norm(state.gravity))
     border = np.zeros((7, _COMMON))
     border[6, _GRAVITY] = state.gravity / length / _PRIOR_LENGTH
-    residual = np.r_[prior[:, 9:] @ state.biases[0], (length - STANDARD_GRAVITY) / _PRIOR_LENGTH]
+    residual = np.r_[prior[:, _BIASES] @ state.biases[0], (length - STANDARD_GRAVITY) / _PRIOR_LENGTH]
     factors.append(Factor(0, residual, np.r_[prior, np.zeros((1, _SIZE))], None, border, ()))
     walk = np.repeat([sensor.gyro_walk, sensor.accel_walk], 3)
     for k, motion in enumerate(motions):
@@ -295,11 +295,11 @@ def _inertial(state: _State, k: int, motion: Preintegrated) -> tuple[np.ndarray,
         matrix[POSITION, 0:3] = sign * R.T @ camera
         matrix[POSITION, 3:6] -= sign * R.T @ camera @ skew(lever)
         matrix[VELOCITY, _SPEED] = sign * R.T
-        matrix[9:, 9:] = sign * np.eye(6)
+        matrix[9:, _BIASES] = sign * np.eye(6)
         border[:, _ROTATION] += by_turn
         border[POSITION, _LEVER] += sign * R.T @ camera
     J[POSITION, _SPEED] = -s * R.T
-    J[:9, 9:] -= motion.slope[:, :6]
+    J[:9, _BIASES] -= motion.slope[:, :6]
     border[:, _DELAY] = -motion.slope[:, 6]
     border[VELOCITY, _GRAVITY], border[POSITION, _GRAVITY] = -s * R.T, -0.5 * s * s * R.T
     return residual, J, K, border

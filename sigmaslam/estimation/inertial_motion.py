@@ -20,7 +20,7 @@ from sigmaslam.geometry.se3 import nearest_rigid, rotation_log, se3_body, se3_ex
 _LOGGER = logging.getLogger(__name__)
 
 # Order of the graph's error state, see sigmaslam_models.estimator.inertial_prediction.
-_POSE, _VELOCITY, _GRAVITY, _BIASES = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 18)
+_POSE, _VELOCITY, _GRAVITY = slice(0, 6), slice(6, 9), slice(9, 12)
 # Delay, factors and mounting of the sensor, and the size of all.
 _SENSOR, _GYRO_BIAS, _SIZE = slice(18, 43), slice(12, 15), 43
 SENSOR_SIGMA = np.array([2e-3, *[5e-3] * 18, *[5e-3] * 3, *[3.5e-3] * 3])

@@ -1,13 +1,12 @@
 """manifest.json beside weights and graphs: their SHA-256, as they were exported."""
 
 import hashlib
-import json
 from collections.abc import Iterable
 from pathlib import Path
 
 from sigmaslam.bounded_files import read_json, shorten
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text
+from sigmaslam.files import atomic_write_json
 
 MANIFEST_NAME = "manifest.json"
 _MANIFEST_BYTES = 1 << 20
@@ -53,4 +52,4 @@ def update_manifest(folder: Path, names: Iterable[str]) -> None:
     path = folder / MANIFEST_NAME
     hashes = read_manifest(path) if path.is_file() else {}
     hashes |= {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
-    atomic_write_text(path, json.dumps(dict(sorted(hashes.items())), indent=2) + "\n")
+    atomic_write_json(path, dict(sorted(hashes.items())))

@@ -141,8 +141,6 @@ class PipeStream:
 class UdpStream:
     """A datagram a frame, whether anyone receives it or not.
 
-    Args:
-
     Attributes:
         name: for messages.
     Raises:

@@ -15,6 +15,7 @@ import numpy as np
 from sigmaslam.bounded_files import TABLE_BYTES, list_folder, read_text, shorten
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES
+from sigmaslam.table import nearest_rows
 
 logger = logging.getLogger(__name__)
 
@@ -143,7 +144,7 @@ def pair_by_stamp(
         if stamp not in _STAMPS:
             raise InputError(f"{file}: {shorten(str(stamp))} is no time in nanoseconds since 1970: rename the image")
     left_stamps, right_stamps = np.array(sorted(left), np.int64), np.array(sorted(right), np.int64)
-    to_right, to_left = _nearest(left_stamps, right_stamps), _nearest(right_stamps, left_stamps)
+    to_right, to_left = nearest_rows(left_stamps, right_stamps), nearest_rows(right_stamps, left_stamps)
     mutual = to_left[to_right] == np.arange(len(left_stamps))
     close = np.abs(right_stamps[to_right] - left_stamps) <= STAMP_TOLERANCE_NS
     chosen = np.flatnonzero(mutual & close)
@@ -209,13 +210,6 @@ def _settle(
         else:
             left_alone = bool(left)
         yield (left.popleft(), None) if left_alone else (None, right.popleft())
-
-
-def _nearest(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Index of the nearest of the sorted `others` for each stamp."""
-    after = np.clip(np.searchsorted(others, stamps), 0, len(others) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(others[before] - stamps) <= np.abs(others[after] - stamps), before, after)
 
 
 def read_times(

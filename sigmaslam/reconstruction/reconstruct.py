@@ -1,6 +1,5 @@
 """A run folder becomes a dense cloud, and a mesh: disparities of each keyframe, fused with its neighbours', merged."""
 
-import json
 import time
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, check_new_folder
+from sigmaslam.files import atomic_write_json, check_new_folder
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
@@ -313,5 +312,5 @@ def _check_writable(path: Path | None) -> None:
 def _add_to_report(run: Path, points: DenseCloud, summary: ReconstructionSummary) -> None:
     """Leaves an even selection of the points, and the summary, in the run's folder and writes its report anew."""
     write_dense_points(run / DENSE_NAME, points.points, points.sigma, points.colours)
-    atomic_write_text(run / RECONSTRUCTION_NAME, json.dumps(asdict(summary), indent=2) + "\n")
+    atomic_write_json(run / RECONSTRUCTION_NAME, asdict(summary))
     write_report(run)

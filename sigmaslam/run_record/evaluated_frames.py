@@ -1,6 +1,5 @@
 """evaluation.json and evaluation.npz of a run: its errors, in all and frame by frame."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 
 from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, save_arrays
+from sigmaslam.files import atomic_write_json, save_arrays
 from sigmaslam.table import Table
 
 EVALUATION_NAME, EVALUATED_FRAMES_NAME = "evaluation.json", "evaluation.npz"
@@ -37,7 +36,7 @@ class EvaluatedFrames(Table):
 def write_evaluation(folder: Path, evaluation: dict[str, Any], frames: EvaluatedFrames) -> None:
     """Writes both files into the folder of the run."""
     save_arrays(folder / EVALUATED_FRAMES_NAME, **frames.arrays())
-    atomic_write_text(folder / EVALUATION_NAME, json.dumps(evaluation, indent=2) + "\n")
+    atomic_write_json(folder / EVALUATION_NAME, evaluation)
 
 
 def read_evaluated_frames(path: Path, count: int) -> EvaluatedFrames:

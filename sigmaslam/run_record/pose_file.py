@@ -8,7 +8,7 @@ import numpy as np
 
 from sigmaslam.files import atomic_path, atomic_write_bytes
 from sigmaslam.geometry.se3 import matrix_to_quaternion
-from sigmaslam.run_record.appended_file import AppendedFile, pack_rows, read_rows
+from sigmaslam.run_record.appended_file import pack_rows, read_rows
 from sigmaslam.run_record.frame_table import FrameTable
 from sigmaslam.table import Table
 
@@ -41,15 +41,9 @@ class PoseRecords(Table):
     matching: np.ndarray
 
 
-class PoseWriter(AppendedFile):
-    """Appends poses to the file in the folder of a run, a new one or one that goes on."""
-
-    def __init__(self, folder: Path, goes_on: bool = False) -> None:
-        super().__init__(folder / PARTIAL_POSES, goes_on)
-
-    def add(self, timestamp: float, pose: np.ndarray, covariance: np.ndarray, matching: np.ndarray) -> None:
-        """Takes a row of `PoseRecords`; it is on disk when this returns."""
-        self.append(pack_rows(np.array([timestamp]), pose[None], covariance[None], matching[None]))
+def pack_pose(timestamp: float, pose: np.ndarray, covariance: np.ndarray, matching: np.ndarray) -> bytes:
+    """A row of `PoseRecords` as `PARTIAL_POSES` has it."""
+    return pack_rows(np.array([timestamp]), pose[None], covariance[None], matching[None])
 
 
 def read_pose_records(folder: Path) -> PoseRecords:

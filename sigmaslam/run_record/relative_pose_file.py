@@ -8,12 +8,13 @@ import numpy as np
 from sigmaslam.bounded_files import load_columns
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_bytes
-from sigmaslam.run_record.appended_file import AppendedFile, pack_rows, read_rows
+from sigmaslam.run_record.appended_file import pack_rows, read_rows
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
-from sigmaslam.table import Table
+from sigmaslam.table import Table, nearest_rows
 
 RELATIVE_POSES_NAME = "relative_poses.npz"
 PARTIAL_RELATIVE_POSES = "relative_poses.partial"
+"""Where they are while a run goes on, so that they outlive it and memory does not grow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +35,9 @@ class FramePairs(Table):
     covariance: np.ndarray
 
 
-class RelativePoseWriter(AppendedFile):
-    """Appends relative poses to a file in the folder of a run, so that they outlive it and memory does not grow."""
-
-    def __init__(self, folder: Path, goes_on: bool = False) -> None:
-        super().__init__(folder / PARTIAL_RELATIVE_POSES, goes_on)
-
-    def add(self, frame: int, relative: RelativePoses) -> None:
-        """Takes those of a frame, by its row in trajectory.tum."""
-        frames = np.full(len(relative), frame)
-        self.append(pack_rows(frames, relative.span, relative.timestamp, relative.pose, relative.covariance))
+def pack_relative_poses(frame: int, relative: RelativePoses) -> bytes:
+    """Those of a frame, by its row in trajectory.tum, as `PARTIAL_RELATIVE_POSES` has them."""
+    return pack_rows(np.full(len(relative), frame), *relative.columns())
 
 
 def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
@@ -52,7 +46,7 @@ def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
     known = columns[0] < len(timestamps)
     later, span, earlier_time, pose, covariance = (column[known] for column in columns)
     # The nearest: time stamps that were read from trajectory.tum are rounded.
-    earlier = np.searchsorted(0.5 * (timestamps[1:] + timestamps[:-1]), earlier_time)
+    earlier = nearest_rows(earlier_time, timestamps)
     return FramePairs(np.array(SPANS)[span.astype(np.int64)], earlier, later.astype(np.int64), pose, covariance)
 
 

@@ -1,7 +1,6 @@
 """The folder of a run: what is known of each frame is written there as it comes."""
 
 import hashlib
-import json
 import os
 import platform
 import shlex
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, check_new_folder, csv_text, printable, save_arrays, write_ply
+from sigmaslam.files import atomic_write_json, check_new_folder, csv_text, printable, save_arrays, write_ply
 from sigmaslam.frontend.build import own_networks
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -25,8 +24,8 @@ from sigmaslam.inference.onnx_graph import shipped_weights
 from sigmaslam.run_record.appended_file import AppendedFile, is_in_use
 from sigmaslam.run_record.frame_table import COLUMNS, DOUBTS_SEPARATOR, FRAMES_NAME, KEYFRAME_COLUMNS
 from sigmaslam.run_record.inertial_file import InertialWriter
-from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseWriter
-from sigmaslam.run_record.relative_pose_file import RelativePoseWriter
+from sigmaslam.run_record.pose_file import PARTIAL_POSES, pack_pose
+from sigmaslam.run_record.relative_pose_file import PARTIAL_RELATIVE_POSES, pack_relative_poses
 from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.point_map import PointMap
@@ -75,9 +74,9 @@ class RunWriter:
         self.calibration: CalibrationEstimate | None = None
         try:
             out.mkdir(parents=True, exist_ok=True)
-            atomic_write_text(out / RUN_NAME, json.dumps({**self.run, "ended": UNFINISHED}, indent=2) + "\n")
-            self._poses = PoseWriter(out, goes_on)
-            self._relative_poses = RelativePoseWriter(out, goes_on)
+            atomic_write_json(out / RUN_NAME, {**self.run, "ended": UNFINISHED})
+            self._poses = AppendedFile(out / PARTIAL_POSES, goes_on)
+            self._relative_poses = AppendedFile(out / PARTIAL_RELATIVE_POSES, goes_on)
             self._table = AppendedFile(out / FRAMES_NAME, goes_on)
             self._inertial = InertialWriter(out, goes_on) if "imu" in run else None
         except OSError as error:
@@ -102,10 +101,10 @@ class RunWriter:
         """
         self.calibration = estimate.calibration
         if estimate.has_pose:
-            self._poses.add(estimate.timestamp, pose, covariance, matching)
+            self._poses.append(pack_pose(estimate.timestamp, pose, covariance, matching))
             if self._inertial is not None and estimate.inertial is not None:
                 self._inertial.add(estimate.timestamp, estimate.inertial)
-            self._relative_poses.add(self._count, estimate.relative_poses)
+            self._relative_poses.append(pack_relative_poses(self._count, estimate.relative_poses))
             if estimate.tracks is not None and self._rectified is not None:
                 self._tracks.append((self._count, estimate.tracks))
             self._count += 1

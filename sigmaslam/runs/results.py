@@ -1,6 +1,5 @@
 """The results of a run, made from what it left on disk as it went; each is tried on its own."""
 
-import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.errors import OutputError, SigmaSlamError
 from sigmaslam.estimation.frame_clock import stamp_noise
-from sigmaslam.files import atomic_write_text, save_array, save_arrays
+from sigmaslam.files import atomic_write_json, save_array, save_arrays
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
@@ -117,8 +116,7 @@ def write_results(
             summary["imu"] = [asdict(each) for each in judged]
     summary["world"] = _describe_world(summary, run)
     summary["failure"] = explain_failure(summary, run.get("map") is not None, started, findings)
-    content = json.dumps({**run, "summary": summary}, indent=2) + "\n"
-    files.attempt(RUN_NAME, lambda path: atomic_write_text(path, content))
+    files.attempt(RUN_NAME, lambda path: atomic_write_json(path, {**run, "summary": summary}))
     if len(frames):
         from sigmaslam.report.report import write_report  # not needed before the run has ended
 

@@ -32,6 +32,7 @@ from sigmaslam.run_record.relative_pose_file import (
 from sigmaslam.run_record.removal import remove_results
 from sigmaslam.run_record.run_folder import RUN_NAME
 from sigmaslam.slam.start_pose import StartPose
+from sigmaslam.table import nearest_rows
 
 # What must be as it was; paths and settings of the command line.
 _SAME = ("input", "format", "frontend", "backend", "provider", "weights", "mask", "configuration", "calibration")
@@ -187,5 +188,4 @@ def _is_among(times: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N,) bool, which of the time stamps (N,) are among the other ones (M,), both increasing; seconds."""
     if not len(others):
         return np.zeros(len(times), bool)
-    nearest = others[np.searchsorted(0.5 * (others[1:] + others[:-1]), times)]
-    return np.asarray(np.abs(nearest - times) < _SAME_TIME)
+    return np.asarray(np.abs(others[nearest_rows(times, others)] - times) < _SAME_TIME)

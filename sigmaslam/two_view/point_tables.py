@@ -2,14 +2,13 @@
 
 import csv
 import io
-import json
 from pathlib import Path
 
 import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, load_columns, read_text, shorten
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_text, csv_text
+from sigmaslam.files import atomic_write_json, atomic_write_text, csv_text
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rigid_motion, se3_inverse
@@ -146,7 +145,7 @@ def orient_files(source: Path, target: Path, out: Path, with_scale: bool, sigma:
         "covariance_of": ["x", "y", "z", "turn_x", "turn_y", "turn_z", "log_scale"][: len(found.covariance)],
         "residuals": dict(zip(names, residuals.tolist(), strict=True)),
     }
-    atomic_write_text(out, json.dumps(content, indent=2) + "\n")
+    atomic_write_json(out, content)
     deviation = np.sqrt(np.diag(found.covariance))
     scale = f"; scale {found.scale:.6g} ± {found.scale * deviation[6]:.2g}" if with_scale else ""
     doubt = f"residuals of {rms / apart:.0%} of the spread: do ids, units (--scale) and handedness agree?\n"

@@ -15,10 +15,12 @@ from sigmaslam.files import save_arrays
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_tum
+from sigmaslam.run_record.appended_file import AppendedFile
 from sigmaslam.run_record.relative_pose_file import (
+    PARTIAL_RELATIVE_POSES,
     FramePairs,
-    RelativePoseWriter,
     collect_frame_pairs,
+    pack_relative_poses,
     read_frame_pairs,
 )
 from sigmaslam.slam.relative_poses import SPANS, RelativePoses
@@ -186,10 +188,10 @@ def some_rows(timestamps: np.ndarray, spans: list[int], seed: int) -> RelativePo
 
 def test_the_file_round_trips(tmp_path: Path):
     times = 1.5e9 + np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 20))
-    writer = RelativePoseWriter(tmp_path)
+    writer = AppendedFile(tmp_path / PARTIAL_RELATIVE_POSES)
     rows = {5: some_rows(times[[0, 3]], [4, 0], 1), 6: RelativePoses.empty(), 19: some_rows(times[[17]], [6], 2)}
     for frame in range(20):
-        writer.add(frame, rows.get(frame, RelativePoses.empty()))
+        writer.append(pack_relative_poses(frame, rows.get(frame, RelativePoses.empty())))
     writer.close()
     save_arrays(tmp_path / "relative_poses.npz", **collect_frame_pairs(tmp_path, times).arrays())
     pairs = read_frame_pairs(tmp_path / "relative_poses.npz", 20)

@@ -12,7 +12,7 @@ from sigmaslam_benchmarks.tracking.page import fill_page, number, number_with_er
 
 # Goals of the page.
 _MH01_METRES, _MH01_MEDIAN, _MH01_ATE = 0.05, 0.03, 0.0039
-_MH01_NEES, _STATE_NEES = (0.5, 2.0), (0.7, 1.4)
+_MH01_NEES = (0.5, 2.0)
 _WITHIN = 0.95
 _IMAGES, _, _SENSORS = METHODS
 

@@ -12,6 +12,7 @@ from sigmaslam.estimation.chi_square import CHI_SQUARE_95
 from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.table import nearest_rows
 from sigmaslam.two_view.absolute_orientation import absolute_orientation
 from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors
 
@@ -147,12 +148,8 @@ def associate(
         InputError: no timestamps agree (the message gives both ranges).
     """
     if len(estimate) and len(truth):
-        after = np.clip(np.searchsorted(truth.timestamps, estimate.timestamps), 0, len(truth) - 1)
-        before = np.maximum(after - 1, 0)
-        difference_after = np.abs(truth.timestamps[after] - estimate.timestamps)
-        difference_before = np.abs(truth.timestamps[before] - estimate.timestamps)
-        nearest = np.where(difference_before <= difference_after, before, after)
-        difference = np.minimum(difference_before, difference_after)
+        nearest = nearest_rows(estimate.timestamps, truth.timestamps)
+        difference = np.abs(truth.timestamps[nearest] - estimate.timestamps)
         # Of several estimates that share a true pose, np.unique keeps the first: the nearest in this order.
         candidates = np.flatnonzero(difference <= max_difference)
         candidates = candidates[np.argsort(difference[candidates], kind="stable")]

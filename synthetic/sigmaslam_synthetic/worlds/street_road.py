@@ -37,7 +37,6 @@ class Road:
     def __init__(self, rng: np.random.Generator, way: np.ndarray, closed: bool, opposite: float) -> None:
         way = way[np.append(True, np.linalg.norm(np.diff(way, axis=0), axis=1) > 1e-6)]
         arc = arc_length(way[:, :2])
-        self._way, self._arc = way, arc
         s = np.linspace(0.0, arc[-1], max(2, int(arc[-1] / _STEP) + 1))
         points = np.stack([np.interp(s, arc, way[:, k]) for k in range(3)], axis=-1)
         if closed:

@@ -225,7 +225,9 @@ def test_a_file_without_room_costs_a_message_and_not_the_others(
     with monkeypatch.context() as disk:
         disk.setattr("sigmaslam.files.atomic_path", full_for({name}))
         if name == "run.json":  # there was room for it when the run began
-            disk.setattr("sigmaslam.run_record.run_folder.atomic_write_text", lambda path, text: path.write_text(text))
+            disk.setattr(
+                "sigmaslam.run_record.run_folder.atomic_write_json", lambda p, run: p.write_text(json.dumps(run))
+            )
         result = run_here("track", sequence, "--out", tmp_path / "run", "--frontend", "klt")
     assert_refused(result, f"could not write {name}; make room", "No space left on device")
     lost = {name} | ({"covariance_final.npy"} if name == "trajectory_final.tum" else set())

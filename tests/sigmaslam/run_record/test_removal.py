@@ -6,7 +6,8 @@ import pytest
 
 from sigmaslam.errors import InputError
 from sigmaslam.report.report import write_report
-from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseWriter
+from sigmaslam.run_record.appended_file import AppendedFile
+from sigmaslam.run_record.pose_file import PARTIAL_POSES
 from sigmaslam.run_record.removal import remove_run
 from tests.support.recorded_runs import make_run
 
@@ -64,7 +65,7 @@ def test_what_is_no_run_is_not_removed(run: Path):
 
 
 def test_a_run_that_goes_on_is_not_removed(run: Path):
-    writer = PoseWriter(run)
+    writer = AppendedFile(run / PARTIAL_POSES)
     with pytest.raises(InputError, match="still goes on"):
         remove_run(run)
     assert (run / PARTIAL_POSES).is_file()

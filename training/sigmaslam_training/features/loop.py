@@ -1,6 +1,5 @@
 """The training loop: resumable at any step, the same result on as many processes whether it was interrupted or not."""
 
-import json
 import time
 from contextlib import closing, nullcontext
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from sigmaslam.files import atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_json, make_folder
 from sigmaslam.progress import open_progress
 from sigmaslam_training.devices import Workplace, loss_module, open_workplace, to_device
 from sigmaslam_training.features.checkpoint import (
@@ -81,7 +80,7 @@ def train(
         card = make_card(state, place)
         if place.leads:
             save_tensors(out / WEIGHTS_NAME, state.network.state_dict())
-            atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
+            atomic_write_json(out / CARD_NAME, card)
     return card
 
 

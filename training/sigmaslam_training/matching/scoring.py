@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.chi_square import CHI_SQUARE_68_OF_2, CHI_SQUARE_95
-from sigmaslam.files import atomic_write_text, make_folder
+from sigmaslam.files import atomic_write_json, atomic_write_text, make_folder
 from sigmaslam.progress import open_progress
 from sigmaslam_evaluation.metrics import probability_calibration as calibration
 from sigmaslam_evaluation.metrics.probability_calibration import RIGHT
@@ -102,7 +102,7 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
     card = _make_card(origin, config, networks, metrics, clock.seconds())
     for name, network in zip((SCORER_NAME, VERIFIER_NAME, PLACE_VERIFIER_NAME), networks.values(), strict=True):
         save_tensors(out / name, network.state_dict())
-    atomic_write_text(out / CARD_NAME, json.dumps(card, indent=2) + "\n")
+    atomic_write_json(out / CARD_NAME, card)
     return card
 
 
@@ -134,7 +134,7 @@ def _claim(out: Path, config: ScoringConfig) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is not empty: give a new folder with --out")
     make_folder(out)
-    atomic_write_text(path, json.dumps(asdict(config), indent=2) + "\n")
+    atomic_write_json(path, asdict(config))
 
 
 def _make_records(progress: Progress, folder: Path, seed: int, count: int, workers: int) -> list[Path]:
