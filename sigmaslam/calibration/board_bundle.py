@@ -13,7 +13,7 @@ import numpy as np
 
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel
-from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, skew
+from sigmaslam.geometry.se3 import nearest_rigid, se3_exp, se3_inverse, skew, transform_points
 from sigmaslam.table import Table
 
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -162,7 +162,7 @@ def _in_eyes(rig: Rig, poses: np.ndarray, corners: Corners) -> list[tuple[np.nda
     frames = [(np.eye(3), left)]
     if len(rig.eyes) > 1:
         T_right_left = se3_inverse(rig.T_left_right)
-        frames.append((T_right_left[:3, :3], left @ T_right_left[:3, :3].T + T_right_left[:3, 3]))
+        frames.append((T_right_left[:3, :3], transform_points(T_right_left, left)))
     return frames
 
 

@@ -10,7 +10,7 @@ from sigmaslam.calibration.board_bundle import BoardBundle, Corners, Rig, projec
 from sigmaslam.calibration.boards import MIN_CORNERS, DetectedCorners
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, DistortionModel
-from sigmaslam.geometry.se3 import rigid_motion, rotation_log, se3_inverse
+from sigmaslam.geometry.se3 import rigid_motion, rotation_log, se3_inverse, transform_points
 
 LENSES: dict[str, tuple[DistortionModel, int]] = {
     "none": ("none", 0),
@@ -238,7 +238,7 @@ def _board_poses(rig: Rig, corners: Corners) -> dict[int, tuple[float, np.ndarra
         found = cv2.solvePnP(corners.points[mine], rays[mine, :2].copy(), np.eye(3), None)
         if found[0] and found[2][2, 0] > 0.0:
             T = rigid_motion(cv2.Rodrigues(found[1])[0], found[2][:, 0])
-            seen = eye.project(corners.points[mine] @ T[:3, :3].T + T[:3, 3])
+            seen = eye.project(transform_points(T, corners.points[mine]))
             poses[image] = (_rms(seen - corners.pixels[mine]), T)
     return poses
 

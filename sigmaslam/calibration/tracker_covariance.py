@@ -8,7 +8,7 @@ from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.geometry.calibration_covariance import ERROR_NAMES, CalibrationCovariance
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import se3_inverse, transform_points
 
 # Where the errors are compared: columns, rows and inverse depths of a grid, from infinity to so many baselines.
 _GRID = (24, 16, 6)
@@ -77,7 +77,7 @@ def measured_places(uvd: np.ndarray, true: StereoCamera, rectifier: StereoRectif
     """(M, 3) what a calibrated pair measures of points that would be at (u, v, disparity) (M, 3) if it were right."""
     view, calibrated, T_right_left = rectifier.rectified, rectifier.camera, se3_inverse(true.T_left_right)
     points = view.triangulate(uvd) @ rectifier.R_rectified_left
-    in_right = points @ T_right_left[:3, :3].T + T_right_left[:3, 3]
+    in_right = transform_points(T_right_left, points)
     rays_left = calibrated.left.unproject(true.left.project(points)) @ rectifier.R_rectified_left.T
     rays_right = calibrated.right.unproject(true.right.project(in_right)) @ rectifier.R_rectified_right.T
     seen, seen_right = view.project(rays_left), view.project(rays_right)

@@ -11,7 +11,7 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_json, atomic_write_text, csv_text
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.geometry.se3 import rigid_motion, se3_inverse
+from sigmaslam.geometry.se3 import rigid_motion, se3_inverse, transform_points
 from sigmaslam.geometry.uncertainty import propagate
 from sigmaslam.two_view.absolute_orientation import absolute_orientation
 from sigmaslam.two_view.triangulation import TwoViews, triangulate
@@ -67,7 +67,7 @@ def triangulate_file(source: Path, camera: StereoCamera, out: Path, method: str,
 def _misses(camera: StereoCamera, points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """(N,) pixels between (N, 4), of which points (N, 3) are made, and where these are seen; infinite outside."""
     T = se3_inverse(camera.T_left_right)
-    seen = camera.left.project(points), camera.right.project(points @ T[:3, :3].T + T[:3, 3])
+    seen = camera.left.project(points), camera.right.project(transform_points(T, points))
     ways = np.linalg.norm(np.stack(seen, axis=1) - pixels.reshape(-1, 2, 2), axis=2).max(axis=1)
     sizes = [size for eye in (camera.left, camera.right) for size in (eye.width, eye.height)]
     return np.where(((pixels > -1.0) & (pixels < sizes)).all(axis=1) & np.isfinite(ways), ways, np.inf)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sigmaslam.geometry.se3 import rigid_motion
+from sigmaslam.geometry.se3 import rigid_motion, transform_points
 from sigmaslam_synthetic.motion.paths import Path, noise
 from sigmaslam_synthetic.rendering.shapes import Box, Cylinder, Ellipsoid, Panel
 from sigmaslam_synthetic.scene import Body
@@ -48,7 +48,7 @@ def stand(model: Model, T_world_model: np.ndarray) -> list[Body]:
     """The model at rest at a pose (4, 4)."""
     R = Rotation.from_matrix(T_world_model[:3, :3])
     rotations = (R * Rotation.from_rotvec([part.rotation for part in model])).as_rotvec().tolist()
-    positions = np.array([part.position for part in model]) @ T_world_model[:3, :3].T + T_world_model[:3, 3]
+    positions = transform_points(T_world_model, np.array([part.position for part in model]))
     return [
         Body(part.shape, part.material, tuple(position), tuple(rotation))
         for part, position, rotation in zip(model, positions.tolist(), rotations, strict=True)
@@ -123,7 +123,7 @@ def covered_share(models: Sequence[tuple[Model, np.ndarray]], T_world_camera: np
         for parts, poses in outlines:
             T = T_camera_world @ poses[k]
             for points in parts:
-                seen = points @ T[:3, :3].T + T[:3, 3]
+                seen = transform_points(T, points)
                 if seen[:, 2].max() < 0.05:
                     continue
                 places = seen[:, :2] / np.maximum(seen[:, 2:], 0.05)
@@ -226,7 +226,7 @@ def _outline(part: Part) -> np.ndarray:
     if isinstance(part.shape, Box | Panel):
         points = np.concatenate([points, facets.origin + facets.edge_u + facets.edge_v])
     T = part.pose()
-    return np.asarray(np.unique(points.round(6), axis=0) @ T[:3, :3].T + T[:3, 3])
+    return transform_points(T, np.unique(points.round(6), axis=0))
 
 
 def _level(R_world_camera: np.ndarray) -> np.ndarray:
