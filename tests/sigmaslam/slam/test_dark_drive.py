@@ -55,7 +55,7 @@ def test_a_dark_second_at_8_metres_a_second(real_data, sensor):
     truth[:, :3] = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
     sequence, rng = open_sequence(folder), np.random.default_rng(7)
     give_sensor(sequence, folder, sensor)
-    tracker = _build_tracker(sequence, TrackerOptions(frontend="klt", threads=1), None, None)
+    tracker = _build_tracker(sequence, TrackerOptions(frontend="klt", threads=1), None, ())
     sensors, estimates = _sensors(sequence, tracker), []
     errors, again, nees = [], [], []
     for k, frame in enumerate(sequence.frames()):
