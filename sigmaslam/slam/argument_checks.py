@@ -21,7 +21,13 @@ _FRONTEND_METHODS = ("name", "observe", "match", "follow")
 
 
 def check_tracker_arguments(
-    camera: object, frontend: object, backend: object, config: object, threads: object, weights: object = None
+    camera: object,
+    frontend: object,
+    backend: object,
+    config: object,
+    threads: object,
+    weights: object = None,
+    right_delay: object = 0.0,
 ) -> None:
     """The arguments with which a tracker is made.
 
@@ -40,6 +46,8 @@ def check_tracker_arguments(
         raise _wrong("threads", threads, "a whole number from 1")
     if weights is not None and not isinstance(frontend, str):
         raise InputError(f"weights {weights} are for a front-end by name: give the networks to your own one instead")
+    if not isinstance(right_delay, Real) or not -1.0 < float(right_delay) < 1.0:
+        raise _wrong("right_delay", right_delay, "seconds, such as 0.01 for ten milliseconds")
 
 
 def check_sample(motion: MotionFilter, name: str, timestamp: float, one: Any, other: Any) -> SampleBuffer:

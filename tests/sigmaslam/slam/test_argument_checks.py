@@ -167,6 +167,12 @@ def test_wrong_arguments_of_both_trackers_are_refused(demo_sequence: Path, chang
         ObjectTracker(region=np.ones((240, 320), bool), **arguments)
 
 
+@pytest.mark.parametrize("delay", [10.0, float("nan"), "0.01"])
+def test_a_delay_that_is_no_part_of_a_second_is_refused(demo_sequence: Path, delay: Any):
+    with pytest.raises(InputError, match=r"right_delay is .*give seconds, such as 0\.01 for ten milliseconds"):
+        StereoTracker(open_sequence(demo_sequence).camera, "klt", right_delay=delay)
+
+
 @pytest.mark.parametrize(
     ("region", "words"),
     [
