@@ -137,9 +137,12 @@ class Localiser:
             if fit is None or (other is not None and self._is_better(other, fit)):
                 matches, fit = other_matches, other
         if fit is not None and fit.count < ACCEPTANCE.doubtful_inliers * self.config.min_inliers:
-            # Chance agreement of a few: in noise, or on repeated texture, where most do not agree.
+            # Chance agreement of a few: in noise, or on repeated texture, where most do not agree. After a gap the
+            # motion hardly says which of its periods it is.
             most = fit.count >= ACCEPTANCE.guided_share * len(matches.probability)
             if fit.nis_before_scaling > (ACCEPTANCE.noise_nis if most else ACCEPTANCE.doubtful_nis):
+                return matches, None
+            if not most and self.frame_clock.after_gap:
                 return matches, None
         return matches, fit
 
