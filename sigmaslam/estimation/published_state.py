@@ -16,8 +16,6 @@ from sigmaslam.estimation.window_state import WindowState, scale_considered, sca
 
 def with_shown_errors(window: KeyframeWindow) -> WindowState:
     """The posterior with errors of the calibration as large as images show, as a map keeps it for later runs."""
-    if window.worse == 1.0:
-        return window.posterior
     return scale_considered(window.posterior, _considered_growth(window))
 
 

@@ -140,9 +140,8 @@ class Localiser:
             # Chance agreement of a few: in noise, or on repeated texture, where most do not agree. After a gap the
             # motion hardly says which of its periods it is.
             most = fit.count >= ACCEPTANCE.guided_share * len(matches.probability)
-            if fit.nis_before_scaling > (ACCEPTANCE.noise_nis if most else ACCEPTANCE.doubtful_nis):
-                return matches, None
-            if not most and self.frame_clock.after_gap:
+            largest = ACCEPTANCE.noise_nis if most else ACCEPTANCE.doubtful_nis
+            if fit.nis_before_scaling > largest or (self.frame_clock.after_gap and not most):
                 return matches, None
         return matches, fit
 
