@@ -9,6 +9,7 @@ import pytest
 
 from sigmaslam.estimation.constant_velocity import MotionState
 from sigmaslam.estimation.held_offset import HeldOffset
+from sigmaslam.estimation.published_state import published_state
 from sigmaslam.estimation.state_layout import pose_slice
 from sigmaslam.frontend.types import StereoView
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
@@ -67,8 +68,11 @@ def live_and_final(frontend: SimulatedFrontend, scale: Scale, config: TrackerCon
     rows = np.searchsorted(final.timestamps, kept["keyframe_timestamps"][:count])
     # The camera is rectified already: the window's frame is the left camera's.
     np.testing.assert_allclose(final.poses[rows], poses, atol=1e-9)
-    inside = np.array([kept["keyframe_covariance"][6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(rows))])
+    whole = published_state(tracker._window).all_poses.whole_covariance
+    inside = np.array([whole[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
     there = turn_covariance(se3_inverse(poses), inside)
+    # A map leaves what neighbours share to the run that reads it.
+    assert np.trace(kept["keyframe_covariance"]) <= np.trace(whole) * (1.0 + 1e-5)
     np.testing.assert_allclose(covariances[rows], there, atol=1e-5 * np.abs(there).max())
     assert is_regular(covariances[1:]).all()
     return [errors_of(live, said, frontend.poses), errors_of(final, covariances, frontend.poses)]
