@@ -22,6 +22,7 @@ _GATED = 3
 
 # Where views are linearised: (n,) and (n, n) of the state, and (M, 6) how landmarks moved.
 _POINT = "offset", "spread", "moved"
+_Feed = dict[str, np.ndarray]
 
 
 class FrameUpdate:
@@ -93,10 +94,11 @@ class FrameUpdate:
         # Landmarks are estimated along with the pose: measured places and depths in the role of true ones would
         # draw the pose towards no motion.
         at = {"offset": offset, "spread": spread, "moved": np.zeros((len(views), LANDMARK_SIZE))}
-        known = self._views(views.landmark, views.common, pose, factor)
-        known |= {"measurement": views.measurement, "noise": views.noise, "scale": np.array(scale)}
-        robust = self._step_robustly(known, at, start is None, min_inliers)
-        found = None if robust is None else self._step_gated(known, robust, min_inliers)
+        # In the order of the modules' arguments, as torch takes them.
+        measured = {"measurement": views.measurement, "noise": views.noise}
+        known = {"scale": np.array(scale)}, self._views(views.landmark, views.common, pose, factor)
+        robust = self._step_robustly(measured, known, at, start is None, min_inliers)
+        found = None if robust is None else self._step_gated(measured, known, robust, min_inliers)
         if found is None:
             return None
         inliers, squared, noise_scale, (offset, spread, _, common, information, scores, score, prior_cost) = found
@@ -117,27 +119,27 @@ class FrameUpdate:
         )
 
     def _step_robustly(
-        self, known: dict[str, np.ndarray], at: dict[str, np.ndarray], gates_prior: bool, min_inliers: int
-    ) -> dict[str, np.ndarray] | None:
+        self, measured: _Feed, known: tuple[_Feed, _Feed], at: _Feed, gates_prior: bool, min_inliers: int
+    ) -> _Feed | None:
         """Where linearisations with a robust loss lead, the first one gated against the prior if told so."""
         for iteration in range(self._iterations):
             gated = np.array(float(iteration == 0 and gates_prior))
-            *point, usable = self._window.graphs.robust_step({**known, **at, "gated": gated})
+            *point, usable = self._window.graphs.robust_step({**measured, **at, "gated": gated, **known[0], **known[1]})
             if usable < min_inliers:
                 return None
             at = dict(zip(_POINT, point, strict=True))
         return at
 
     def _step_gated(
-        self, known: dict[str, np.ndarray], at: dict[str, np.ndarray], min_inliers: int
+        self, measured: _Feed, known: tuple[_Feed, _Feed], at: _Feed, min_inliers: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]] | None:
         """The same with a gate: inliers (M,), squared residuals (M,), the scale of the noise, and the last solution."""
-        common, freedom = self._window.posterior.common, np.array(self._window.student_freedom)
-        known = {**known, "freedom": freedom, "prior": np.concatenate([common, common[-6:]])}
+        common = self._window.posterior.common
+        own = {"freedom": np.array(self._window.student_freedom), "prior": np.concatenate([common, common[-6:]])}
         inliers: np.ndarray | None = None
         noise_scale = np.array(0.0)  # the first step finds it: before the gate, which would hide how far they scatter
         for iteration in range(_GATED):
-            feed = {**known, **at, "noise_scale": noise_scale}
+            feed = {**measured, **at, "noise_scale": noise_scale, **known[0], **own, **known[1]}
             if inliers is not None and self._window.graphs.is_compiled:
                 feed["inliers"] = inliers
             agree, count, usable, squared, noise_scale, *step = self._window.graphs.gated_step(feed)

@@ -126,9 +126,8 @@ class Mapper:
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
-        # With what neighbours share counted here, too, the truth is missed by more where the calibration is off: it
-        # counts in what is published alone. After a gap they err alike in this view and in all to come: it counts, and
-        # they are asked no more.
+        # What neighbours share counts in what is published: here, it misses the truth by more where the calibration is
+        # off. After a gap they err alike in this view and in all to come: it counts, and they are asked no more.
         self._fitted += 1
         self.window.clustering += (fit.clustering - self.window.clustering) / self._fitted
         shared = 1.0 if matches.after_gap else fit.clustering

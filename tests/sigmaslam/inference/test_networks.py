@@ -34,10 +34,13 @@ def rename(name: str, path: Path, old: str, new: str) -> None:
     model = onnx.load(shipped_weights(name))
     for each in [*model.graph.input, *model.graph.output]:
         each.name = new if each.name == old else each.name
-    for node in model.graph.node:
-        for names in (node.input, node.output):
-            for k, each in enumerate(names):
-                names[k] = new if each == old else each
+    graphs = [model.graph]
+    for graph in graphs:
+        for node in graph.node:
+            graphs += [each.g for each in node.attribute if each.HasField("g")]
+            for names in (node.input, node.output):
+                for k, each in enumerate(names):
+                    names[k] = new if each == old else each
     onnx.save(model, path)
 
 
