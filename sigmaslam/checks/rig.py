@@ -11,6 +11,7 @@ from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.slam.argument_checks import MAX_DELAY
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
 # The tracker searches rows within ROW_TOLERANCE: further off, an error; from half of it on, a warning.
@@ -164,14 +165,10 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
         f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "
         "px in the median: trigger both cameras together"
     )
-    return Finding(
-        _SYNCHRONISATION,
-        "error" if float(np.median(np.abs(fit.by_lag[:, 1]))) > ROW_TOLERANCE else "warning",
-        message,
-        fit.lag,
-        fit.lag_shift,
-        fit.lag * (frame_interval or 0.0),
-    )
+    severity: Severity = "error" if float(np.median(np.abs(fit.by_lag[:, 1]))) > ROW_TOLERANCE else "warning"
+    delay = fit.lag * (frame_interval or 0.0)
+    delay *= abs(delay) < MAX_DELAY
+    return Finding(_SYNCHRONISATION, severity, message, fit.lag, fit.lag_shift, delay)
 
 
 def suspect_pairing(matches: EyeMatches, rectifier: StereoRectifier) -> bool:

@@ -102,14 +102,15 @@ class FrameUpdate:
         if found is None:
             return None
         inliers, squared, noise_scale, (offset, spread, _, common, information, scores, score, prior_cost) = found
-        cross, size = spread[frame, last], (self._window.camera.width, self._window.camera.height)
+        size = self._window.camera.width, self._window.camera.height
+        joint = FramePosterior(offset, spread, common, information, score)
         return FrameFit(
             nearest_rigid(se3_exp(offset[frame]) @ pose),
             se3_exp(self._moves_last * offset[last]) @ posterior.poses[-1],
-            spread[frame, frame] + spread[last, last] - cross - cross.T,
+            joint.relative,
             spread[frame, frame],
             posterior.calibration + offset[CALIBRATION],
-            FramePosterior(offset, spread, common, information, score),
+            joint,
             inliers,
             float(prior_cost + squared[inliers].sum()),
             int(views.components[inliers].sum()),

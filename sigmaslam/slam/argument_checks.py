@@ -17,6 +17,8 @@ from sigmaslam.slam.config import TrackerConfig
 
 # Seconds. A clock that jumps further has another unit, or began anew; the motion in between would be unknown anyway.
 _LONGEST_PAUSE = 1e5
+MAX_DELAY = 1.0
+"""Of the right eye, seconds: more are another unit, or frames so far apart that no velocity lasts."""
 _FRONTEND_METHODS = ("name", "observe", "match", "follow")
 
 
@@ -46,7 +48,7 @@ def check_tracker_arguments(
         raise _wrong("threads", threads, "a whole number from 1")
     if weights is not None and not isinstance(frontend, str):
         raise InputError(f"weights {weights} are for a front-end by name: give the networks to your own one instead")
-    if not isinstance(right_delay, Real) or not -1.0 < float(right_delay) < 1.0:
+    if not isinstance(right_delay, Real) or not abs(float(right_delay)) < MAX_DELAY:
         raise _wrong("right_delay", right_delay, "seconds, such as 0.01 for ten milliseconds")
 
 

@@ -118,6 +118,9 @@ def test_a_delay_of_a_few_milliseconds_is_told_in_seconds():
     assert found["synchronisation"].severity == "warning"
     assert found["synchronisation"].delay == pytest.approx(0.01, abs=0.001)
     assert found["eyes"].delay == 0.0
+    # Stamps in milliseconds: no velocity lasts so long, and no tracker takes that.
+    found = {each.name: each for each in check_rig(matches_of(lag=0.1), StereoRectifier(camera()), 100.0)}
+    assert (found["synchronisation"].severity, found["synchronisation"].delay) == ("warning", 0.0)
 
 
 def test_a_bump_between_two_pairs_is_no_delay():
