@@ -200,9 +200,10 @@ def test_the_command_line_refuses_a_wrong_region_before_it_writes(
 def test_a_rendered_tool_is_followed_and_a_sensor_on_it_takes_drift_away(tmp_path: Path):
     """`sigmaslam train render tool --frames 75 --seed 1` with the box of docs/object.md; a sensor of 0.17 mm, 0.2 deg.
 
-    Means of five draws, each of the same images: noise of one grey level in 5 % of the pixels moves the rotation between
-    0.2 and 0.3 degrees. The sensor is on a rig whose calibration is off by its sigmas: places of the exact one, 0.09 mm
-    off where 1.4 mm are claimed, are better than any filter that is told those sigmas can know (0.16 mm with the sensor).
+    Means of five draws, each of the same images: noise of one grey level in 5 % of the pixels moves the rotation
+    between 0.2 and 0.3 degrees. The sensor is on a rig whose calibration is off by its sigmas: places of the exact one,
+    0.09 mm off where 1.4 mm are claimed, are better than any filter that is told those sigmas can know (0.16 mm with
+    the sensor).
     """
     pytest.importorskip("torch")
     from sigmaslam_synthetic.render_sequence import write_sequence
