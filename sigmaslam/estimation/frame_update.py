@@ -94,11 +94,10 @@ class FrameUpdate:
         # Landmarks are estimated along with the pose: measured places and depths in the role of true ones would
         # draw the pose towards no motion.
         at = {"offset": offset, "spread": spread, "moved": np.zeros((len(views), LANDMARK_SIZE))}
-        # In the order of the modules' arguments, as torch takes them.
-        measured = {"measurement": views.measurement, "noise": views.noise}
-        known = {"scale": np.array(scale)}, self._views(views.landmark, views.common, pose, factor)
-        robust = self._step_robustly(measured, known, at, start is None, min_inliers)
-        found = None if robust is None else self._step_gated(measured, known, robust, min_inliers)
+        known = {"measurement": views.measurement, "noise": views.noise, "scale": np.array(scale)}
+        known |= self._views(views.landmark, views.common, pose, factor)
+        robust = self._step_robustly(known, at, start is None, min_inliers)
+        found = None if robust is None else self._step_gated(known, robust, min_inliers)
         if found is None:
             return None
         inliers, squared, noise_scale, (offset, spread, _, common, information, scores, score, prior_cost) = found
@@ -119,20 +118,18 @@ class FrameUpdate:
             scores,
         )
 
-    def _step_robustly(
-        self, measured: _Feed, known: tuple[_Feed, _Feed], at: _Feed, gates_prior: bool, min_inliers: int
-    ) -> _Feed | None:
+    def _step_robustly(self, known: _Feed, at: _Feed, gates_prior: bool, min_inliers: int) -> _Feed | None:
         """Where linearisations with a robust loss lead, the first one gated against the prior if told so."""
         for iteration in range(self._iterations):
             gated = np.array(float(iteration == 0 and gates_prior))
-            *point, usable = self._window.graphs.robust_step({**measured, **at, "gated": gated, **known[0], **known[1]})
+            *point, usable = self._window.graphs.robust_step({**known, **at, "gated": gated})
             if usable < min_inliers:
                 return None
             at = dict(zip(_POINT, point, strict=True))
         return at
 
     def _step_gated(
-        self, measured: _Feed, known: tuple[_Feed, _Feed], at: _Feed, min_inliers: int
+        self, known: _Feed, at: _Feed, min_inliers: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]] | None:
         """The same with a gate: inliers (M,), squared residuals (M,), the scale of the noise, and the last solution."""
         common = self._window.posterior.common
@@ -140,7 +137,7 @@ class FrameUpdate:
         inliers: np.ndarray | None = None
         noise_scale = np.array(0.0)  # the first step finds it: before the gate, which would hide how far they scatter
         for iteration in range(_GATED):
-            feed = {**measured, **at, "noise_scale": noise_scale, **known[0], **own, **known[1]}
+            feed = {**known, **own, **at, "noise_scale": noise_scale}
             if inliers is not None and self._window.graphs.is_compiled:
                 feed["inliers"] = inliers
             agree, count, usable, squared, noise_scale, *step = self._window.graphs.gated_step(feed)
