@@ -161,16 +161,17 @@ def _describe_end(stopped_by: BaseException | None) -> str:
 def _build_tracker(
     sequence: StereoSequence, options: TrackerOptions, start: StartPose | None, findings: Sequence[Finding]
 ) -> Tracker:
-    camera, frontend, backend, config = sequence.camera, options.frontend, options.backend, options.config
-    threads, provider, weights = options.threads, options.provider, options.weights
-    if options.track_object is None:
-        imu = None if sequence.imu is None else sequence.imu.sensor
-        odometry = None if sequence.odometry is None else sequence.odometry.sensor
-        pixels, delay = disparity_error(findings), sum(each.delay for each in findings)
-        images, rig = (frontend, backend, config, None, threads), (pixels, imu, odometry, delay)
-        return StereoTracker(camera, *images, start, provider, weights, *rig)
-    region = read_region(options.track_object, camera.left.width, camera.left.height)
-    return ObjectTracker(camera, region, frontend, backend, config, threads, provider, weights)
+    camera, names = sequence.camera, ("frontend", "backend", "config", "threads", "provider", "weights")
+    common: dict[str, Any] = {name: getattr(options, name) for name in names}
+    if options.track_object is not None:
+        region = read_region(options.track_object, camera.left.width, camera.left.height)
+        return ObjectTracker(camera, region, **common)
+    imu = None if sequence.imu is None else sequence.imu.sensor
+    odometry = None if sequence.odometry is None else sequence.odometry.sensor
+    pixels, delay = disparity_error(findings), sum(each.delay for each in findings)
+    return StereoTracker(
+        camera, start=start, disparity_error=pixels, imu=imu, odometry=odometry, right_delay=delay, **common
+    )
 
 
 def _describe_location(location: LocationFilter | None) -> dict[str, Any]:
