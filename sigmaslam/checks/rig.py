@@ -61,8 +61,7 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
     if findings[0].severity == "error":
         # The other checks judge the rig as it is once the eyes are exchanged.
         matches, given = exchanged, fit_rows(exchanged, view)
-    findings.append(_check_position(given, rectifier))
-    findings.append(_check_distortion(matches, rectifier))
+    findings += [_check_position(given, rectifier), _check_distortion(matches, rectifier)]
     if findings[1].severity == "error":
         return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:])
     findings.append(_check_synchronisation(given, frame_interval))

@@ -67,8 +67,7 @@ class FrameClock:
 
     def __init__(self) -> None:
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
-        self._is_believed, self._seconds, self.late = True, 0.0, 0.0
-        self.was_blind = False
+        self._is_believed, self._seconds, self.late, self.was_blind = True, 0.0, 0.0, False
 
     @property
     def interval(self) -> float:
@@ -79,6 +78,12 @@ class FrameClock:
     def after_gap(self) -> bool:
         """Nothing was seen for longer than usual."""
         return self.late > 0.0 or self.was_blind
+
+    @property
+    def differs(self) -> bool:
+        """The last interval is unlike the one before: the velocity, or how far it leads, may be wrong by the ratio."""
+        last = [*self._intervals][-2:]
+        return len(last) == 2 and bool(np.ptp(last) > _IRREGULAR * np.mean(last))
 
     @property
     def is_slow(self) -> bool:

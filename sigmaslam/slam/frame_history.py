@@ -229,14 +229,12 @@ class FrameHistory:
         """Poses and covariances of the left camera, of all frames that hang at keyframes, in parts."""
         if not self._chain:
             return []
-        keyframes = self._state.all_poses
-        places = [self._ids.index(id) for id in self._chain]
+        keyframes, places = self._state.all_poses, [self._ids.index(id) for id in self._chain]
         parts = []
         for first, last, interval in zip([places[0], *places], places, self._intervals, strict=False):
             step = se3_inverse(keyframes.poses[first]) @ keyframes.poses[last]
             parts.append(interval.settled(step).frames.between(first, last, keyframes))
-        newest = HangingFrames.at_first(smooth_motion(self._links))
-        parts.append(newest.between(places[-1], places[-1], keyframes))
+        parts.append(HangingFrames.at_first(smooth_motion(self._links)).between(places[-1], places[-1], keyframes))
         return [self._in_left_camera(*part) for part in parts]
 
     def _in_left_camera(self, poses: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -166,7 +166,8 @@ class Localiser:
         A sensor of motion knows how much of it is still in view.
         """
         before = self.follower.count if self.motion.turn is None else len(matches.searched)
-        return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < ACCEPTANCE.left_over * before
+        share = ACCEPTANCE.guided_share if self.frame_clock.differs else ACCEPTANCE.left_over
+        return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < share * before
 
     def _is_better(self, other: FrameFit, fit: FrameFit) -> bool:
         """Whether another pose fits better than a doubtful one, or more agrees with it."""

@@ -64,16 +64,15 @@ class Recovery:
 
     def start_or_recover(self, view: StereoView, timestamp: float) -> KeyframeTracks | None:
         """Without a pose: starts, or waits for a while and goes on with the uncertainty of the prediction."""
-        course = self.course
-        enough = view.has_stereo(self.admission.min_points, self.config.min_inliers)
-        if course.phase is Phase.WAITING_IN_MAP or not enough:
+        course, config = self.course, self.config
+        if course.phase is Phase.WAITING_IN_MAP or not view.has_stereo(self.admission.min_points, config.min_inliers):
             return None
         if course.phase is Phase.WAITING:
             # Of an earlier run it was a keyframe.
             accepted = self.start is not None or np.isfinite(view.disparity).mean() >= ACCEPTANCE.start_stereo_share
             return self._start(view, timestamp) if accepted and not self._waits(view, timestamp) else None
         since = timestamp - course.tracked_at
-        if since <= self.config.lost_seconds or not self.admission.restarts_anywhere:
+        if since <= config.lost_seconds or not self.admission.restarts_anywhere:
             return None
         _LOGGER.warning("tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, since)
         if course.has_moved and dead_reckoning(self.motion) is None:

@@ -119,3 +119,10 @@ def test_a_long_interval_may_be_a_clock_that_was_set(intervals: list[float], lat
     for each in intervals:
         clock.tick(each)
     assert clock.late == pytest.approx(late)
+
+
+def test_an_interval_unlike_the_one_before_is_known_even_where_stamps_are_believed():
+    """Stamps that take turns by one to four look as if frames were missing."""
+    clock = FrameClock()
+    told = [(clock.tick(step)[1], clock.differs) for step in (0.04, 0.16, 0.16)]
+    assert told == [(0.0, False), (0.0, True), (0.0, False)]

@@ -68,3 +68,13 @@ def test_what_agrees_with_both_poses_does_not_speak_for_the_prediction(
     localiser = Localiser(window, nothing, update, *[nothing] * 3, CONFIG, nothing)
     prediction = Prediction(np.eye(4), np.eye(6))
     assert localiser._fit_alone(matches, near, prediction, np.eye(4), 1.0) is (alone if is_taken else None)
+
+
+@pytest.mark.parametrize("differs", [False, True])
+def test_a_third_of_the_landmarks_is_too_little_after_an_interval_unlike_the_one_before(differs: bool):
+    """A street whose stamps take turns by 0.04 and 0.16 s: 67 of 202 agreed on a pose 2 m ahead."""
+    followed: Any = SimpleNamespace(turn=None, count=202, differs=differs)
+    nothing: Any = None
+    localiser = Localiser(nothing, followed, nothing, nothing, followed, nothing, CONFIG, followed)
+    fit: Any = SimpleNamespace(nis_per_dof=1.56, count=67)
+    assert localiser._is_doubtful(nothing, fit) == differs
