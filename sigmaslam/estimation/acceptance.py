@@ -12,7 +12,7 @@ class Acceptance:
             swapped, which following cannot tell.
         stereo_usual_gain: per frame, by which the usual share follows; after a fall, too, so that what stays becomes
             usual.
-        guided_share: of the matches near a prediction; fewer agree where the prediction has become a mover's.
+        guided_share: of the matches near a prediction, lest it be a mover's; for `left_over` after an odd interval.
         unguided_share: of the matches near a pose without a prediction; fewer suffice, it was told from movers before.
         doubtful_nis: NIS per degree of freedom; a fit above it may sit in a wrong place.
         noise_nis: likewise where half of the matches agree: half of what chance agreement in pure noise has.
