@@ -39,7 +39,8 @@ def test_flow_contradicts_a_sensor_only_where_it_finds_most_landmarks(found: int
     motion = Motion(turn=np.eye(3), widened=4.0)
     update = SimpleNamespace(fit=lambda *args: None)
     follower = SimpleNamespace(count=300)
-    given: list[Any] = [SimpleNamespace(), motion, update, None, follower, None, SimpleNamespace(min_inliers=12), None]
+    config = SimpleNamespace(min_inliers=12)
+    given: list[Any] = [SimpleNamespace(), motion, update, None, follower, None, config, FrameClock()]
     localiser = Localiser(*given)
     matches = GuidedMatches.empty()
     object.__setattr__(matches, "searched", np.arange(571))
