@@ -27,11 +27,7 @@ _REFUSED = (
     ("no INPUT", ("no --camera",), "give either INPUT, a recording, or --camera, live cameras"),
     ("INPUT", ("--camera",), "give either INPUT, a recording, or --camera, live cameras, not both"),
     ("INPUT", ("--seconds",), "--seconds goes with --camera; a recording is tracked to its end"),
-    (
-        "--camera",
-        ("no --calibration",),
-        "--camera needs --calibration: any file that `sigmaslam calibrate show` reads",
-    ),
+    ("--camera", ("no --calibration",), "--camera needs --calibration: any file that `sigmaslam calibrate show` reads"),
     ("--camera", ("--format", "--topic-left", "--topic-right"), "{all} go with INPUT, not with --camera"),
     ("--camera", ("--start", "--frames", "--every", "--scale"), "{all} go with INPUT, not with --camera"),
     ("--camera", ("--imu", "--odometry"), "{all} go with INPUT, not with --camera"),

@@ -46,9 +46,10 @@ class Doubts:
         if error is not None:
             self.spread = self.spread + np.outer(error, error)
 
-    def add_motion(self, pose: np.ndarray, other: np.ndarray) -> None:
-        """Two poses (4, 4), T_world_camera, explain the image about as well."""
+    def add_motion(self, pose: np.ndarray, other: np.ndarray, covariance: float | np.ndarray = 0.0) -> None:
+        """Two poses (4, 4), T_world_camera, explain the image about as well, `covariance` (6, 6) between them."""
         self.add(Doubt.MOTIONS, se3_log(pose @ se3_inverse(other)))
+        self.spread = self.spread + covariance
         self.is_ambiguous = self.spoils_keyframe = True
 
     @property

@@ -46,7 +46,8 @@ class Scrutiny:
         self._clock, self._moving = clock, moving
         # Places are all that is asked of it; a torn image leaves none in the next one.
         self._rival = MovingRegion(0.0, patience=0)
-        self._T_rival_fit = np.eye(4)
+        self._T_rival_fit = self._parting = np.eye(4)
+        self._rival_covariance = np.zeros((6, 6))
         self._last_error, self._had_other_times = 0.0, False
         self._input_is_wrong = input_is_wrong
         self.timing = EyeTiming(self._window.camera.baseline)
@@ -89,13 +90,16 @@ class Scrutiny:
             doubts.add_motion(matches.rival, fit.pose)
         self._doubt_prediction(doubts, fit)
         if second is not None and not second.is_mover and not self._is_other(second, fit):
-            # Nothing decides between the two as long as what asks for the other moves.
-            self._T_rival_fit = second.pose @ se3_inverse(fit.pose)
+            # Nothing decides between the two as long as what asks for the other moves; they part on as they last did.
+            T_rival_fit = second.pose @ se3_inverse(fit.pose)
+            self._parting = T_rival_fit @ se3_inverse(self._T_rival_fit) if self._rival else T_rival_fit
+            self._T_rival_fit, self._rival_covariance = T_rival_fit, second.covariance
             if moving is not None:
                 self._add(self._rival, matches, second)
-            doubts.add_motion(second.pose, fit.pose)
+            doubts.add_motion(second.pose, fit.pose, second.covariance)
         elif self._rival:
-            doubts.add_motion(self._T_rival_fit @ fit.pose, fit.pose)
+            self._T_rival_fit = self._parting @ self._T_rival_fit
+            doubts.add_motion(self._T_rival_fit @ fit.pose, fit.pose, self._rival_covariance)
         if doubts.prediction_is_wrong:
             fit = self._localiser.fit_again(matches, fit, Prediction.of(self._window, self._motion))
         return matches, fit, doubts

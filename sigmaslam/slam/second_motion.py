@@ -10,8 +10,9 @@ from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.mahalanobis import quantiles
 from sigmaslam.estimation.prediction_errors import surprise
+from sigmaslam.estimation.state_layout import CALIBRATION
 from sigmaslam.geometry.image_cells import explained_area, image_cells
-from sigmaslam.geometry.se3 import se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.guided_matching import CONFIRMED, GuidedMatches
 from sigmaslam.slam.landmark_places import seen_from
@@ -31,6 +32,7 @@ class SecondMotion:
     Attributes:
         first: the pose beside which it is one.
         pose: (4, 4) T_world_camera as if these landmarks stood still.
+        covariance: (6, 6) of it relative to the first, perturbed from the left in the world.
         agreeing: (K,) numbers of the matches.
         expected: (K, 3) (u, v, disparity) where the first pose sees them.
         departure: (K, 2) pixels from there to where they are.
@@ -40,6 +42,7 @@ class SecondMotion:
 
     first: FrameFit
     pose: np.ndarray
+    covariance: np.ndarray
     agreeing: np.ndarray
     expected: np.ndarray
     departure: np.ndarray
@@ -74,16 +77,9 @@ def find_second_motion(
     first, most = (explained_area(cells, each, equal) for each in (fit.inliers, possible))
     if possible.sum() < MIN_POINTS or most < least * (first + most):
         return None
-    landmarks = window.landmarks
-    covariance = landmarks.covariance[rows[others], :3, :3]
-    relative = estimate_relative_pose(
-        camera,
-        expected[others],
-        np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
-        views.measurement[others],
-        views.covariance[others],
-        matches.probability[others],
-    )
+    landmarks, seen, noise = window.landmarks, views.measurement[others], views.covariance[others]
+    sigma = np.sqrt(np.diagonal(landmarks.covariance[rows[others], :3, :3], axis1=1, axis2=2))
+    relative = estimate_relative_pose(camera, expected[others], sigma, seen, noise, matches.probability[others])
     if relative is None:
         return None
     agreeing = others[relative.inliers]
@@ -98,7 +94,9 @@ def find_second_motion(
     if not (is_rival or moves):
         return None
     is_mover = nearer and (share < ACCEPTANCE.second_motion or np.median(landmarks.views[rows[agreeing]]) < CONFIRMED)
-    return SecondMotion(fit, fit.pose @ relative.T_key_camera, agreeing, expected[agreeing], departure, is_mover)
+    pose = fit.pose @ relative.T_key_camera
+    own = relative.with_shared_errors(window.posterior.whole_covariance[CALIBRATION, CALIBRATION]).covariance
+    return SecondMotion(fit, pose, turn_covariance(pose, own), agreeing, expected[agreeing], departure, is_mover)
 
 
 def find_scene_behind(
@@ -147,7 +145,7 @@ def find_scene_behind(
         if len(moves) >= MIN_POINTS and not see_the_same(apart):
             doubts.spread, doubts.spoils_keyframe = np.zeros((6, 6)), False
             far = replace(far, inliers=_among(np.flatnonzero(~near)[far.inliers], len(rows)))
-            return SecondMotion(far, fit.pose, moves, by_far[moves], departure[moves], True)
+            return SecondMotion(far, fit.pose, own, moves, by_far[moves], departure[moves], True)
     return None
 
 

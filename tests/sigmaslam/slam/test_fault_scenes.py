@@ -123,6 +123,14 @@ def test_half_the_image_on_movers_from_the_first_frame_is_not_followed():
 
 
 @pytest.mark.slow
+def test_two_motions_that_part_on_are_both_in_the_covariance():
+    """The same, four frames: where movers are followed, the scene is seen to be left behind in the second one alone."""
+    simulation = simulate(Recipe("street", 8, seed=2, movers=0.5, width=640, height=192))
+    estimates, truth = tracked(simulation, filmed(simulation)[0][:4])
+    assert_honest(estimates, truth[:4])
+
+
+@pytest.mark.slow
 def test_movers_that_are_masked_do_no_harm():
     """People in half of a room's image: masked by their own pixels, as good as if they were not there."""
     simulation = simulate(Recipe("room", 20, seed=1, movers=0.5, width=320, height=240))
