@@ -171,12 +171,12 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
 
 
 def suspect_pairing(matches: EyeMatches, rectifier: StereoRectifier) -> bool:
-    """Whether row differences go with the motion, or follow no rig, as if the right images were of other frames."""
+    """Whether rows go with the motion, scatter or follow no rig, as if the right images were of other frames."""
     if len(matches) < MIN_MATCHES:
         return False
     fit = fit_rows(matches, rectifier.rectified)
     if fit.agreement(ROW_TOLERANCE) >= _EXPLAINED:
-        return fit.lag_shift >= _WARN_LAG
+        return max(fit.lag_shift, _mad(fit.residual)) >= _WARN_LAG
     return _agreement(exchange_eyes(matches, rectifier), rectifier.rectified) < _EXPLAINED
 
 
