@@ -39,8 +39,7 @@ def reconstruct(
     min_views: Annotated[int, typer.Option(min=1, help="Keyframes that must have given a point.")] = 2,
     every: Annotated[int, typer.Option(min=1, help="Use one of so many keyframes.")] = 1,
     export: Annotated[
-        Path | None,
-        typer.Option(help="New folder for images, poses and points as nerfstudio and COLMAP read them."),
+        Path | None, typer.Option(help="New folder for images, poses and points as nerfstudio and COLMAP read them.")
     ] = None,
 ) -> None:
     """Reconstruct the surfaces that the keyframes of a run saw: a dense cloud in which each point has a covariance.

@@ -99,8 +99,8 @@ def times_verdict(summary: dict[str, Any]) -> str | None:
     words = [f"Time {jitter_words(noise)}."] if noise > 0.0 else []
     if repeated:
         words.append(
-            f"{repeated} frames show an image of a frame before, or an eighth of one or more, to the byte: they were "
-            "skipped (same image), and their poses are predicted. Does the driver freeze, or tear images?"
+            f"{repeated} frames show an image of a frame before, or an eighth of one or more, to the byte, or a "
+            "shifted one: they were skipped, and poses are predicted. Does the driver freeze, tear or shift images?"
         )
     return " ".join(words) or None
 

@@ -53,8 +53,8 @@ class Estimate:
         status: "starting"; "tracking"; "doubtful": tracked, but `doubts` speak against the pose, and the covariance
             holds what they may make of it; "ambiguous": likewise, and another pose explains the image about as well;
             "lost"; "inertial" or "odometry": lost by images, and predicted by that sensor; "skipped": one of the images
-            has been delivered before, the pose is predicted; or "relocalised": found again among keyframes that had
-            left the window, or in the map.
+            has been delivered before, or is shifted, the pose is predicted; or "relocalised": found again among
+            keyframes that had left the window, or in the map.
         belief: 1 - sqrt of the largest eigenvalue of the covariance of the pose relative to the keyframe (metres and
             radians together), clipped to [0, 1] (Tables 9.1, 9.2); 0 without a pose.
         matches, inliers: points matched to the keyframe, and those that passed the gate.

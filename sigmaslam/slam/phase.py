@@ -21,12 +21,13 @@ class Course:
         timestamp: of the last frame, seconds; None before the first.
         waiting_since: time stamp of the first view that could be a keyframe, blurred or not, seconds.
         started_at, tracked_at: time stamps of the first keyframe and of the last pose.
+        is_shifted: the last pair showed a bump, and was skipped: that stays, an image gone wrong is one alone.
     """
 
     def __init__(self) -> None:
         self.phase = Phase.WAITING
         self.timestamp: float | None = None
-        self.waiting_since = inf
+        self.waiting_since, self.is_shifted = inf, False
         self.started_at = self.tracked_at = 0.0
 
     def start(self, timestamp: float) -> None:

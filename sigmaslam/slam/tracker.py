@@ -196,26 +196,26 @@ class StereoTracker:
                 twist_sigma = self.config.initial_twist_sigma(self._window.depth)
                 self._motion.set_twist(self._motion.twist / stretch, twist_sigma)
             self._motion.predict(seconds, self.config.densities(self._window.depth), sigma, timestamp)
-        is_repeated = self._last_pairs.is_repeated(left, right)
+        is_skipped = self._last_pairs.is_repeated(left, right)
         matches, fit, change, doubts = GuidedMatches.empty(), None, None, Doubts()
-        if not is_repeated and not is_noise(left):
+        if not is_skipped and not is_noise(left):
             matches, fit, change = by_times(self._localiser, partial(self._localise, frame, timestamp, clock, doubts))
+        is_skipped |= change is not None and not self._course.is_shifted
+        self._course.is_shifted = change is not None and is_skipped
         if fit is None and dead_reckoning(self._motion) is not None:
             # Images that give no pose say nothing against the prediction either.
             self._motion.widen(1.0 / self._motion.widened)
-        landmarks = self._window.landmarks.id[matches.views.landmark]
-        inliers = None if fit is None else fit.inliers
-        self.last_frame = MatchedFrame(frame.left, frame.right, landmarks, matches, inliers, frame.usable)
+        seen = frame.left, frame.right, self._window.landmarks.id[matches.views.landmark], matches
+        self.last_frame = MatchedFrame(*seen, None if fit is None else fit.inliers, frame.usable)
         predicted = filtered = self._motion.state
         if fit is not None:
             matches, fit, doubts = self._scrutiny.doubt(frame, matches, fit)
-            status = doubts.status
-            expected = self._motion.step, self._motion.step_covariance
+            status, expected = doubts.status, (self._motion.step, self._motion.step_covariance)
             blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))
             fit = self._correct(fit, of_matches, matches, timestamp)
             filtered = self._motion.state
             tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected, doubts)
-        elif is_repeated:
+        elif is_skipped:
             status, tracks = "skipped", None
         elif change is not None:
             doubts.add(Doubt.RIG)
@@ -229,12 +229,12 @@ class StereoTracker:
         else:
             status = self._recovery.status
             tracks = self._recovery.start_or_recover(frame.view, timestamp)
-        if not is_repeated:
+        if not is_skipped:
             self._follower.remember_frame(frame.left, matches, fit, tracks)
         loop = self._loops.close() if tracks is not None else None
         clock.lap("map")
         # The images before it again, or too little in stereo.
-        self._clock.was_blind = is_repeated or (fit is None and not self._relocaliser.is_enough(frame.view))
+        self._clock.was_blind = is_skipped or (fit is None and not self._relocaliser.is_enough(frame.view))
         self._course.timestamp = timestamp
         estimate = self._reporter.report(timestamp, status, matches, fit, tracks, loop, clock.milliseconds, doubts)
         self._history.append(estimate, predicted, filtered)

@@ -180,6 +180,14 @@ def tear(frames: Frames, rng: np.random.Generator) -> Frames:
     return changed
 
 
+def shift_left(columns: float, frames: Frames, rng: np.random.Generator) -> Frames:
+    """The left image lacks the beginning of its lines, once in ten frames."""
+    changed = list(frames)
+    for number in range(5, len(frames), 10):
+        changed[number] = replace(frames[number], left=shift_image(frames[number].left, 0.0, columns))
+    return changed
+
+
 def lag_right(frames: Frames, rng: np.random.Generator) -> Frames:
     """The right eye is a frame behind, all along."""
     number = np.arange(len(frames))
@@ -343,6 +351,7 @@ FAULTS: dict[str, Fault] = {
     "repeated": Fault("an old pair under a new stamp, once in ten", repeat_out_of_order),
     "out_of_order": Fault("two pairs exchanged, stamps in order, once in ten", swap_neighbours),
     "torn": Fault("lower halves of the frame before, once in ten", tear),
+    "left_shifted": Fault("left image 8 px to the right, once in ten", partial(shift_left, 8.0)),
     "right_lags": Fault("the right eye is a frame behind", lag_right),
     "exposure": Fault("2.5 times the light from half time on", partial(step_exposure, 2.5)),
     "gain": Fault("gains hunt from half time on, each eye alone", step_gain),

@@ -34,7 +34,7 @@ def test_an_eye_that_becomes_late_is_no_bump(demo: Demo):
     [(3.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 0.3), (*MOTION, 0.0), (-MOTION[0], -MOTION[1], 0.0)],
     ids=["rows", "columns", "turned", "as the scene moved", "against that"],
 )
-def test_a_bump_is_named_in_its_frame(demo: Demo, rows: float, columns: float, degrees: float):
-    frames = demo[1][: AT + 2]
+def test_a_bump_is_named_in_its_second_frame(demo: Demo, rows: float, columns: float, degrees: float):
+    frames = demo[1][: AT + 3]
     bumped = [replace(each, right=turn_image(shift_image(each.right, rows, columns), degrees)) for each in frames[AT:]]
-    assert bumped_frames(demo, frames[:AT] + bumped) == [AT]
+    assert bumped_frames(demo, frames[:AT] + bumped) == [AT + 1]
