@@ -83,7 +83,7 @@ def _rig_case(name: str, fault: Fault) -> Case:
 def _of_kitti(name: str, fault: Fault) -> Case:
     def attempt(folder: Path, run: Runner) -> Outcome:
         data = Path(os.environ["SIGMASLAM_DATA"]).resolve()
-        return track_injected(fault, source=lambda: data / _KITTI)(folder, run)
+        return track_injected(fault, source=lambda: data / _KITTI, long=True)(folder, run)
 
     return Case("rig", f"{name} (KITTI)", attempt, 3, (fault.word,), slow=True, data=_KITTI)
 
