@@ -165,8 +165,9 @@ class Localiser:
 
         A sensor of motion knows how much of it is still in view.
         """
-        before = self.follower.count if self.motion.turn is None else len(matches.searched)
-        share = ACCEPTANCE.guided_share if self.frame_clock.differs else ACCEPTANCE.left_over
+        is_sensed = self.motion.turn is not None
+        before = len(matches.searched) if is_sensed else self.follower.count
+        share = ACCEPTANCE.guided_share if self.frame_clock.differs and not is_sensed else ACCEPTANCE.left_over
         return fit.nis_per_dof > ACCEPTANCE.doubtful_nis or fit.count < share * before
 
     def _is_better(self, other: FrameFit, fit: FrameFit) -> bool:
