@@ -170,22 +170,21 @@ def swap_neighbours(frames: Frames, rng: np.random.Generator) -> Frames:
 
 def tear(frames: Frames, rng: np.random.Generator) -> Frames:
     """The lower half of both images is of the frame before, once in ten frames."""
-    changed = list(frames)
-    for number in range(5, len(frames), 10):
-        old = frames[number - 1]
-        half = old.left.shape[0] // 2
+
+    def torn(number: int) -> DrivenFrame:
+        old, half = frames[number - 1], frames[number].left.shape[0] // 2
         left, right = frames[number].left.copy(), frames[number].right.copy()
         left[half:], right[half:] = old.left[half:], old.right[half:]
-        changed[number] = replace(frames[number], left=left, right=right)
-    return changed
+        return replace(frames[number], left=left, right=right)
+
+    return _once_in_ten(frames, torn)
 
 
 def shift_left(columns: float, frames: Frames, rng: np.random.Generator) -> Frames:
     """The left image lacks the beginning of its lines, once in ten frames."""
-    changed = list(frames)
-    for number in range(5, len(frames), 10):
-        changed[number] = replace(frames[number], left=shift_image(frames[number].left, 0.0, columns))
-    return changed
+    return _once_in_ten(
+        frames, lambda number: replace(frames[number], left=shift_image(frames[number].left, 0.0, columns))
+    )
 
 
 def lag_right(frames: Frames, rng: np.random.Generator) -> Frames:
@@ -303,6 +302,11 @@ def _show(frames: Frames, left: np.ndarray, right: np.ndarray | None = None) -> 
         replace(frame, left=frames[a].left, right=frames[b].right)
         for frame, a, b in zip(frames, left, right, strict=True)
     ]
+
+
+def _once_in_ten(frames: Frames, change: Callable[[int], DrivenFrame]) -> Frames:
+    """The frames, some of them changed, by their numbers."""
+    return [change(number) if number % 10 == 5 else frame for number, frame in enumerate(frames)]
 
 
 def _frozen(frames: int, first: int, count: int) -> np.ndarray:
