@@ -25,6 +25,8 @@ _SLOWEST = 0.5
 _SET = 2.5
 # Of the mean interval: cameras are as regular, whatever their stamps. With more near landmarks are not searched for.
 _IRREGULAR = 0.25
+# Seconds: after a pause predictions are not extrapolated any further, as variances that grow with t^3 drown all else.
+_LONGEST = 20.0
 # Of the mean interval: no two frames of a camera are closer.
 _LEAST_STEP = 0.1
 
@@ -97,7 +99,7 @@ class FrameClock:
             The time between the two frames, its standard deviation, seconds, and by what velocities are too large that
             were learned by a wrong interval, or 1.
         """
-        before = [*self._intervals]
+        before, interval = [*self._intervals], min(interval, _LONGEST)
         self._intervals.append(interval)
         seconds, sigma = self._estimate(np.array(self._intervals))
         # Of bursts the longest interval is the usual one: they end in such, one like the other.

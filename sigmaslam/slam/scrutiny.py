@@ -131,7 +131,7 @@ class Scrutiny:
         image, pose, old_ids, old_seen = self._before or (left, fit.pose, ids, seen)
         ways = seen_apart(self._window, rows, pose, fit.pose)
         moves = ways > 3.0 * ACCEPTANCE.stands
-        if self._before is None or 2 * moves.sum() > np.isfinite(ways).sum():
+        if self._before is None or 2 * moves.sum() >= np.isfinite(ways).sum():
             _, now, then = np.intersect1d(ids, old_ids, assume_unique=True, return_indices=True)
             stays = moves[now] & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
             is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves[now].sum()

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from sigmaslam.readers import open_sequence
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.tracker import StereoTracker
+from tests.support.estimates import track
 
 if TYPE_CHECKING:
     from tests.support.estimates import Demo
@@ -34,6 +38,19 @@ def test_the_last_keyframe_is_asked_after_images_that_showed_nothing(
     frame = frames[4 if hidden == "none" else 7]
     tracker.step(np.flipud(frame.left).copy(), np.flipud(frame.right).copy(), frame.timestamp)
     assert asked == [is_asked]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("pause", [60.0, 3600.0])
+def test_another_scene_after_a_pause_is_tracked(real_data: Path, pause: float):
+    """Nothing of the window is seen again: the way in between is unknown, and nothing in the new scene is doubtful."""
+    sequence = open_sequence(real_data / "kitti_raw_0926_0039_a")
+    frames = list(sequence.frames())
+    frames = frames[:12] + [replace(each, timestamp=each.timestamp + pause) for each in frames[150:168]]
+    estimates = track(StereoTracker(sequence.camera, threads=1), frames)
+    assert [each.status for each in estimates[-10:]] == ["tracking"] * 10
+    assert all(np.isfinite(each.covariance).all() for each in estimates[-10:])
+    assert np.sqrt(np.trace(estimates[-1].covariance[:3, :3])) > 100.0
 
 
 def test_landmarks_seen_across_a_gap_are_asked_once(demo: Demo):
