@@ -30,8 +30,6 @@ def hang_over(
     Returns:
         Numbers of those that are forgotten for it.
     """
-    if not most:
-        return [leaving.id]
     packed = PackedView.of(leaving.view, _FEATURES)
     own = HangingKeyframe(leaving.id, leaving.timestamp, packed, leaving.id, leaving.step, leaving.covariance)
     hanging[leaving.id] = own

@@ -78,7 +78,7 @@ class StereoTracker:
         disparity_error: pixels by which a check found disparities to be off: poses are doubtful, and less certain.
         imu: an inertial sensor on the rig, whose samples `add_imu` takes.
         odometry: wheels under the rig, whose samples `add_odometry` takes.
-        right_delay: seconds by which right images are taken later than left ones; disparities are corrected for it.
+        right_delay: seconds by which right images are later than left ones: disparities are corrected, bumps not seen.
 
     Attributes:
         rectifier: of the images that are tracked.
@@ -231,7 +231,7 @@ class StereoTracker:
             tracks = self._recovery.start_or_recover(frame.view, timestamp)
         if not is_skipped:
             self._follower.remember_frame(frame.left, matches, fit, tracks)
-        loop = self._loops.close() if tracks is not None else None
+        loop = self._loops.close() if tracks is not None and status != "relocalised" else None
         clock.lap("map")
         # The images before it again, or too little in stereo.
         self._clock.was_blind = is_skipped or (fit is None and not self._relocaliser.is_enough(frame.view))
@@ -273,8 +273,8 @@ class StereoTracker:
             matches, fit = self._localiser.follow(frame, self._keyframes.active, prediction, clock)
             if fit is not None:
                 return matches, fit, None
-            change = find_change(self._localiser, self._keyframes.active[-1].view, frame, matches, prediction)
-            if change is not None:
+            seen = self._localiser, self._keyframes.active[-1].view, frame, matches, prediction
+            if not self._delay and (change := find_change(*seen)) is not None:
                 return matches, None, change
             prediction = Prediction.of(self._window, self._motion)
         view = frame.view

@@ -264,6 +264,16 @@ def test_no_more_keyframes_hang_than_are_asked_for(most: int):
 
 
 @pytest.mark.long
+def test_a_run_that_remembers_less_than_its_map_forgets_it_in_order(tmp_path: Path):
+    """Of thirty keyframes none hangs; those of the map that do are handed on until they are forgotten."""
+    np.savez_compressed(tmp_path / "map.npz", **walked(0.1 * np.arange(120), 240).pack("learned", CAMERA))
+    keyframes = walked(0.1 * np.arange(60), 30, tmp_path / "map.npz", first=200)
+    known = keyframes.left_long_ago()
+    assert {each.origin for each in known} <= {each.id for each in keyframes.remembered}
+    assert len(keyframes.appearance) == len(known)
+
+
+@pytest.mark.long
 def test_maps_of_several_runs_grow(tmp_path: Path):
     """A run in the map of a run in the map of a run: all of their keyframes are known, where they were."""
     path, places = tmp_path / "map.npz", 0.1 * np.arange(50)
@@ -499,6 +509,8 @@ def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
     for k in range(10, 16):
         estimate = tracker.step(frames[k].left, frames[k].right, frames[k].timestamp)
         assert estimate.status == ("relocalised" if k == 10 else "tracking")
+        # By the keyframe that it was found by it is no loop, too.
+        assert k > 10 or estimate.loop is None
         assert np.linalg.norm(error_of(estimate, truth[k])[:3]) < 0.01
         assert squared_error(estimate, truth[k]) < WITHIN_3_SIGMA
     final, covariances = tracker.final_trajectory()
