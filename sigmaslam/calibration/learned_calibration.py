@@ -11,7 +11,7 @@ from sigmaslam.slam.estimate import CalibrationEstimate
 
 
 def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, focal_length: float) -> StereoCamera:
-    """The pair without its disparity offset, which is taken for one of the right principal point.
+    """The pair without its disparity offset, which is taken for one of the right principal point, as are bumped rows.
 
     Where the offset was so large that the baseline must have made up for it, that is corrected, too, and so is what is
     wrong by the evidence, in the right camera. Other errors that were estimated are not: which parameter they belong to
@@ -25,7 +25,7 @@ def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, foca
     # A turn about the vertical is part of the offset.
     offset = learned.disparity_offset / focal_length - yaw
     right = replace(camera.right, fx=zoom * camera.right.fx, fy=zoom * camera.right.fy)
-    right = replace(right, cx=right.cx - offset * right.fx)
+    right = replace(right, cx=right.cx - offset * right.fx, cy=right.cy + learned.raised)
     if "lenses" in shares and right.distortion_model != "equidistant":
         first, *others = right.distortion or (0.0,) * 4
         right = replace(right, distortion_model="radtan", distortion=(first - shares["lenses"], *others))

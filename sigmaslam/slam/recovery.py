@@ -107,6 +107,10 @@ class Recovery:
         while self.keyframes.active:
             self.keyframes.marginalise_oldest(spare=last)
         change_rig(self.window, change.columns)
+        # As if all that is remembered had been seen since.
+        known = *(each.view for each in self.keyframes.remembered), *(k.packed for k in self.keyframes.hanging.values())
+        for view in known:
+            view.disparity[:] += change.columns
         self.course.track(timestamp)
         pose, origin = change.fit.pose, self.keyframes.index(last.id)
         new = NewKeyframe(view, timestamp, pose, pose, change.fit.relative, origin=origin, rig_changed=True)

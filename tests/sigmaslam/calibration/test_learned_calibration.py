@@ -34,6 +34,13 @@ def test_disparities_lose_their_offset():
     assert (left - right)[0, 0] == pytest.approx(50.7)
 
 
+def test_rows_of_a_bump_are_of_the_right_principal_point():
+    """As images that are raised by two rows: a point is seen in one row by both eyes."""
+    learned = learned_calibration(rectified_pair(), CalibrationEstimate(0.0, 0.05, raised=2.0), 500.0)
+    point = np.array([[0.3, 0.1, 2.0]])
+    assert learned.right.project(point)[0, 1] == pytest.approx(learned.left.project(point)[0, 1] + 2.0)
+
+
 def test_the_next_run_begins_with_what_is_still_unknown(tmp_path: Path):
     learned = learned_calibration(raw_rig("radtan"), CalibrationEstimate(-0.4, 0.05), 450.0)
     write_calibration(tmp_path / "learned.yaml", learned)

@@ -71,6 +71,9 @@ def test_noise_gains_of_rows_and_tiny_images_are_not_interlaced(demo: Demo):
     noise = rng.integers(0, 256, scene.shape, np.uint8)
     for image in (uneven, noisy, noise, 0 * noise, noise[:1], noise[:2, :5], noise[:5, :1]):
         assert np.array_equal(LastPairs().of_one_moment(image, image), (image, image))
+    # In so few rows noise has fields by chance.
+    for one, other in rng.integers(0, 256, (20, 2, 48, 64), np.uint8):
+        assert np.array_equal(LastPairs().of_one_moment(one, other), (one, other))
 
 
 def test_a_scene_that_moves_behind_what_stays_is_seen_and_noise_and_light_are_none(demo: Demo):

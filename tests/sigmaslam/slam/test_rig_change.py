@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sigmaslam.readers import StereoFrame
@@ -38,3 +39,17 @@ def test_a_bump_is_named_in_its_second_frame(demo: Demo, rows: float, columns: f
     frames = demo[1][: AT + 3]
     bumped = [replace(each, right=turn_image(shift_image(each.right, rows, columns), degrees)) for each in frames[AT:]]
     assert bumped_frames(demo, frames[:AT] + bumped) == [AT + 1]
+
+
+def test_what_was_seen_before_a_bump_is_as_if_seen_since(demo: Demo):
+    """Loops and relocalisation compare disparities of old keyframes with those of views after it, by one offset."""
+    tracker, frames = StereoTracker(demo[0], "klt", threads=1), demo[1]
+    track(tracker, frames[:AT])
+    before = {each.id: each.view.disparity.copy() for each in tracker._keyframes.active}
+    track(tracker, [replace(each, right=shift_image(each.right, 0.0, 2.0)) for each in frames[AT : AT + 2]])
+    after = {each.id: each.view.disparity for each in tracker._keyframes.remembered}
+    assert before.keys() <= after.keys()
+    for id, disparity in before.items():
+        moved = after[id] - disparity
+        assert np.nanmedian(moved) == pytest.approx(-2.0, abs=0.1)
+        assert np.nanmax(moved) - np.nanmin(moved) < 1e-9
