@@ -24,7 +24,7 @@ _EXPLAINED, _BETTER = 0.5, 2.0
 # A delay that moves the median place by less than this is within the noise of a match, pixels.
 _WARN_LAG = 0.5
 # Many matches share it: far places, which are most, hide what near ones show.
-_LEAST_LAG = 0.1
+_LEAST_LAG = 0.05
 # And one that explains a smaller share of the variance of rows than this may stand for something else.
 _LAG_SHARE = 1 / 3
 # Rows in the stored images agree within this if these are rectified already, pixels.
