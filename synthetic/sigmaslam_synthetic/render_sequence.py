@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +64,10 @@ def write_sequence(
     done(before)
     size = int(np.clip(len(missing) // (4 * workers), 1, _CHUNK))
     film = _Film(out.resolve(), truth, device)
-    chunks = [_Chunk(film, missing[k : k + size]) for k in range(0, len(missing), size)]
+    chunks = [missing[k : k + size] for k in range(0, len(missing), size)]
     count = before
 
-    def ended(_: _Chunk, written: int | Exception) -> None:
+    def ended(_: list[int], written: int | Exception) -> None:
         nonlocal count
         if isinstance(written, Exception):
             raise written
@@ -77,10 +77,9 @@ def write_sequence(
     if ray is None and min(workers, len(chunks)) <= 1:
         opened = film.open() if missing else None
         for number in missing:
-            frame = _Chunk(film, [number])
-            ended(frame, _write_chunk(frame, opened))
+            ended([number], _write_chunk(film, [number], opened))
     else:
-        run_jobs(_write_chunk, chunks, workers, ended, ray, int(device != "cpu"))
+        run_jobs(partial(_write_chunk, film), chunks, workers, ended, ray, int(device != "cpu"))
     join_tracks(out, recipe.frames)
     return before
 
@@ -109,15 +108,14 @@ def write_sequences(
     failed: dict[str, Exception] = {}
     count = 0
 
-    def ended(job: _Rendering, outcome: int | Exception) -> None:
+    def ended(recipe: Recipe, outcome: int | Exception) -> None:
         nonlocal count
         if isinstance(outcome, Exception):
-            failed[job.recipe.name] = outcome
+            failed[recipe.name] = outcome
         count += 1
         done(count)
 
-    jobs = [_Rendering(out.resolve() / recipe.name, recipe, truth, device) for recipe in recipes]
-    run_jobs(_render, jobs, workers, ended, ray, int(device != "cpu"))
+    run_jobs(partial(_render, out.resolve(), truth, device), recipes, workers, ended, ray, int(device != "cpu"))
     if failed:
         raise OutputError(f"{out} lacks {list_failures(failed)}: the same command tries what is missing again")
 
@@ -198,18 +196,8 @@ def command(recipe: Recipe, truth: str) -> str:
     return " ".join(words if truth == "dense" else [*words, "--truth", truth])
 
 
-@dataclass(frozen=True, slots=True)
-class _Rendering:
-    """A sequence that one process writes."""
-
-    out: Path
-    recipe: Recipe
-    truth: str
-    device: str
-
-
-def _render(job: _Rendering) -> int:
-    return write_sequence(job.out, job.recipe, job.truth, device=job.device)
+def _render(out: Path, truth: str, device: str, recipe: Recipe) -> int:
+    return write_sequence(out / recipe.name, recipe, truth, device=device)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,19 +216,10 @@ class _Film:
         return Studio(Simulation.from_json(content["simulation"]), self.device), landmarks
 
 
-@dataclass(frozen=True, slots=True)
-class _Chunk:
-    """Frames that one process writes at a time."""
-
-    film: _Film
-    numbers: list[int]
-
-
-def _write_chunk(chunk: _Chunk, opened: tuple[Studio, Landmarks] | None = None) -> int:
-    film = chunk.film
+def _write_chunk(film: _Film, numbers: list[int], opened: tuple[Studio, Landmarks] | None = None) -> int:
     with torch.inference_mode():
         studio, landmarks = opened or _open_once(film)
-        return write_frames(film.out, studio, landmarks, film.truth, chunk.numbers)
+        return write_frames(film.out, studio, landmarks, film.truth, numbers)
 
 
 @lru_cache(maxsize=1)

@@ -10,22 +10,16 @@ from scipy.spatial.transform import Rotation
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.se3 import rigid_motion
 from sigmaslam_synthetic.camera.sensor import Sensor, expose, random_sensor
+from sigmaslam_synthetic.presets import PRESETS
 from sigmaslam_synthetic.rendering.renderer import RenderedViews, Renderer
 from sigmaslam_synthetic.rendering.visibility import Eye
 from sigmaslam_synthetic.truth import at_pixels, transfer
-from sigmaslam_synthetic.worlds import colon, hall, organ, room, rubble, street, tool
 from sigmaslam_synthetic.worlds.episode import Wish
 from sigmaslam_synthetic.worlds.own import SUFFIX, Generate, load_world
 
-DOMAINS = {
-    "room": room.generate,
-    "street": street.generate,
-    "drone": hall.generate,
-    "colon": colon.generate,
-    "organ": organ.generate,
-}
+DOMAINS = {name: PRESETS[name].generate for name in ("room", "street", "drone", "colon", "organ")}
 # Worlds that the network that ships has not learned from.
-_OTHER_DOMAINS = {"tool": tool.generate, "rubble": rubble.generate}
+_OTHER_DOMAINS = {name: PRESETS[name].generate for name in ("tool", "rubble")}
 _SCENES = 8  # neighbouring pairs come from as many scenes ...
 _USES = 32  # ... each of which serves so many pairs before it is replaced; of forward motion, as it has views
 _VIEWS = 8  # of a scene

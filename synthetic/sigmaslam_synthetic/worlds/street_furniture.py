@@ -222,11 +222,8 @@ def shelter(rng: np.random.Generator, palette: Palette) -> Model:
 
 def _axles(palette: Palette, at: tuple[float, ...], wide: float, radius: float) -> list[Part]:
     """A pair of wheels each, as one cylinder: what lies between them is out of sight."""
-    return [
-        part
-        for x in at
-        for part in (Part(Cylinder(radius, wide + 0.03, None, 8), palette.choose("tyre"), (x, 0.0, radius), _ACROSS),)
-    ]
+    wheels = Cylinder(radius, wide + 0.03, None, 8)
+    return [Part(wheels, palette.choose("tyre"), (x, 0.0, radius), _ACROSS) for x in at]
 
 
 def _ends(rng: np.random.Generator, palette: Palette, long: float, wide: float, z: float, dark: int) -> list[Part]:

@@ -11,16 +11,17 @@ from tests.support.commands import run_here
 
 @pytest.fixture
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Jobs that would be done; the one of seed 13 fails."""
-    jobs: list[Any] = []
+    """Folder, recipe, truth and address of what would be rendered; the one of seed 13 fails."""
+    written: list[Any] = []
 
     def run_jobs(work, asked, workers, ended, ray, gpus):
-        jobs.extend((job, ray) for job in asked)
-        for job in asked:
-            ended(job, ValueError("unlucky") if job.recipe.seed == 13 else 0)
+        for recipe in asked:
+            written.append((*work(recipe), ray))
+            ended(recipe, ValueError("unlucky") if recipe.seed == 13 else 0)
 
     monkeypatch.setattr(render_sequence, "run_jobs", run_jobs)
-    return jobs
+    monkeypatch.setattr(render_sequence, "write_sequence", lambda out, recipe, truth, device: (out, recipe, truth))
+    return written
 
 
 def test_each_seed_has_its_folder_and_the_options_of_all(rendered: list[Any], tmp_path: Path):
@@ -29,8 +30,9 @@ def test_each_seed_has_its_folder_and_the_options_of_all(rendered: list[Any], tm
         "train", "render", "room", "--seeds", "100-102", "--out", out, "--frames", "5", "--ray", "host:6379"
     )
     assert done.returncode == 0
-    assert [job.out for job, _ in rendered] == [out / f"room{seed}" for seed in (100, 101, 102)]
-    assert {(job.recipe.frames, job.truth, ray) for job, ray in rendered} == {(5, "dense", "host:6379")}
+    assert [folder for folder, *_ in rendered] == [out / f"room{seed}" for seed in (100, 101, 102)]
+    assert [recipe.seed for _, recipe, *_ in rendered] == [100, 101, 102]
+    assert {(recipe.frames, truth, ray) for _, recipe, truth, ray in rendered} == {(5, "dense", "host:6379")}
     assert f"3 sequences of 5 stereo pairs in {out}" in done.stdout
 
 
