@@ -109,11 +109,6 @@ class LeastSquares:
     root: Tensor
     has_prior: bool
 
-    @property
-    def is_linear(self) -> bool:
-        """Whether one step is exact."""
-        return all(isinstance(term.model, LinearMeasurement) for term in self.terms)
-
     def retract(self, point: Tensor, tangent: Tensor) -> Tensor:
         """point [+] tangent."""
         return point + tangent if self.space is None else self.space.retract(point, tangent)
@@ -192,7 +187,7 @@ def gauss_newton(problem: LeastSquares, anchor: Tensor, sound: Tensor, iteration
     previous = torch.full_like(cost, torch.inf)
     # Round-off of a cost c is about sqrt(2 c) times this: what the values lose, times the residuals.
     lost = epsilon * torch.sqrt(sum((term.magnitude().detach() for term in problem.terms), torch.zeros_like(cost)))
-    linear = problem.is_linear
+    linear = all(isinstance(term.model, LinearMeasurement) for term in problem.terms)
     for _ in range(1 if linear else iterations):
         if holds_everywhere(~active):
             break

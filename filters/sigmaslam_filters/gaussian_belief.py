@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sigmaslam_filters.core.factors import apply, cholesky, may_look, solve_lower, square, triangularise
 from sigmaslam_filters.core.layout import choose
-from sigmaslam_filters.core.tensors import require_floating, require_symmetric, require_tensor
+from sigmaslam_filters.core.tensors import DTYPES, require_symmetric, require_tensor
 from sigmaslam_filters.core.unrolled_factors import known_lower
 from sigmaslam_filters.manifolds import Space
 
@@ -56,7 +56,9 @@ class Gaussian:
             raise ValueError(f"mean (..., p) and {kind} expected, got {tuple(mean.shape)} and {tuple(given.shape)}")
         if mean.dtype != given.dtype:
             raise ValueError(f"mean and covariance need one floating dtype, got {mean.dtype} and {given.dtype}")
-        require_floating("the belief", mean)
+        # There is no factorisation of integers and half precision.
+        if mean.dtype not in DTYPES:
+            raise ValueError(f"the belief is {mean.dtype}: convert it with .to(torch.float32) or .to(torch.float64)")
         if covariance is not None and not is_symmetric and may_look(covariance):
             require_symmetric("the covariance", covariance)
         if given.shape[:-2] != mean.shape[:-1]:

@@ -99,15 +99,15 @@ class InteractingMultipleModels:
 
     def _mixed(self, beliefs: Sequence[Gaussian], weight: Tensor, first: int) -> Gaussian:
         """The Gaussian with the moments of a mixture of weights (..., M), on a manifold in the chart at its mean."""
-        chart = self.bayes.linearisation.chart
-        reference = beliefs[first].mean
+        linearisation, reference = self.bayes.linearisation, beliefs[first].mean
+        chart = linearisation.chart
         parts = weight.unbind(dim=-1)
 
         def offset(belief: Gaussian, point: Tensor) -> Tensor:
             return belief.mean - point if chart is None else chart(belief.mean, point)
 
         shifts = [part.unsqueeze(-1) * offset(belief, reference) for part, belief in zip(parts, beliefs, strict=True)]
-        mean = self.bayes.linearisation.retract(reference, torch.stack(shifts).sum(dim=0))
+        mean = linearisation.retract(reference, torch.stack(shifts).sum(dim=0))
         covariance = torch.zeros_like(beliefs[first].covariance)
         for part, belief in zip(parts, beliefs, strict=True):
             apart = offset(belief, mean).unsqueeze(-1)
@@ -115,7 +115,6 @@ class InteractingMultipleModels:
                 inside = belief.covariance
             else:
                 # About its own mean, but seen from the mixture's.
-                columns = self.bayes.linearisation.carry(belief.mean, None, belief.factor, mean)
-                inside = square(columns)
+                inside = square(linearisation.carry(belief.mean, None, belief.factor, mean))
             covariance = covariance + part[..., None, None] * (inside + apart @ apart.mT)
         return Gaussian(mean, covariance, is_symmetric=True)

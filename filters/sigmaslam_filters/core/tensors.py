@@ -25,16 +25,6 @@ def require_tensor(name: str, given: object) -> None:
         raise TypeError(f"{name} must be a torch tensor, got {shown}: convert it once with torch.as_tensor")
 
 
-def require_floating(name: str, given: Tensor) -> None:
-    """Refuses integers and half precision, for which there is no factorisation.
-
-    Raises:
-        ValueError: the dtype is neither float32 nor float64.
-    """
-    if given.dtype not in DTYPES:
-        raise ValueError(f"{name} is {given.dtype}: convert it with .to(torch.float32) or .to(torch.float64)")
-
-
 def require_dtype(name: str, given: Tensor, expected: torch.dtype) -> None:
     """Refuses a dtype other than the belief's: nothing is converted silently.
 

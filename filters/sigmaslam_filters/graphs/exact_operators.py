@@ -34,7 +34,8 @@ class ExactOperators(TorchFunctionMode):
             if isinstance(first, Tensor) and first.dtype == second.dtype == torch.bool:
                 return (condition & first) | (~condition & second)
             return func(condition, first, second)
-        if not _is_double([*args, *options.values()]):
+        tensors = [each for each in [*args, *options.values()] if isinstance(each, Tensor)]
+        if all(each.dtype != torch.float64 for each in tensors):
             return func(*args, **options)
         if name in ("add", "sub", "subtract") and "alpha" in options:
             return func(args[0], args[1] * _exact(options["alpha"], args[0]))
@@ -43,14 +44,9 @@ class ExactOperators(TorchFunctionMode):
         if name == "full_like" and _is_rounded(args[1]):
             return _exact(args[1], args[0])
         if name in _ELEMENTWISE:
-            like = next(each for each in [*args, *options.values()] if isinstance(each, Tensor))
-            lifted = {key: _exact(value, like) for key, value in options.items()}
-            return func(*(_exact(each, like) for each in args), **lifted)
+            lifted = {key: _exact(value, tensors[0]) for key, value in options.items()}
+            return func(*(_exact(each, tensors[0]) for each in args), **lifted)
         return func(*args, **options)
-
-
-def _is_double(values: Iterable[Any]) -> bool:
-    return any(isinstance(value, Tensor) and value.dtype == torch.float64 for value in values)
 
 
 def _as_tensors(condition: Any, first: Any, second: Any) -> tuple[Any, Any, Any]:
@@ -117,11 +113,6 @@ def _acos(x: Tensor) -> Tensor:
     return _atan2(torch.sqrt((1.0 - x) * (1.0 + x)), x)
 
 
-def _copysign(size: Tensor, sign: Tensor) -> Tensor:
-    """Of a negative zero the sign is lost."""
-    return torch.where(sign < 0, -size.abs(), size.abs())
-
-
 def _sinc(x: Tensor) -> Tensor:
     angle = x * _exact(math.pi, x)
     zero = angle == 0
@@ -140,7 +131,8 @@ _REPLACED: Mapping[str, Callable[..., Tensor]] = {
     "acos": _acos,
     "arccos": _acos,
     "tan": lambda x: torch.sin(x) / torch.cos(x),
-    "copysign": _copysign,
+    # Of a negative zero the sign is lost.
+    "copysign": lambda size, sign: torch.where(sign < 0, -size.abs(), size.abs()),
     "signbit": lambda x: x < 0,
     "sinc": _sinc,
     "special_sinc": _sinc,

@@ -66,6 +66,11 @@ def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
     return a, b, c
 
 
+def plus(left: Vector, right: Vector) -> Vector:
+    """Sum of two vectors."""
+    return left[0] + right[0], left[1] + right[1], left[2] + right[2]
+
+
 def exp_so3(rotation: Vector) -> Quaternion:
     """Unit quaternion of a rotation vector."""
     x, y, z = rotation
@@ -115,7 +120,7 @@ def jacobian_se3(twist: tuple[Vector, Vector], change: tuple[Vector, Vector]) ->
     second = 2.0 * (sine * sine)
     across = _apply_v(turned, rotation, second, third)
     coupled = _coupling(translation, rotation, turned, across, second, third)
-    return _plus(_apply_v(moved, rotation, second, third), coupled), across
+    return plus(_apply_v(moved, rotation, second, third), coupled), across
 
 
 def inverse_jacobian_se3(twist: tuple[Vector, Vector], change: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
@@ -217,10 +222,6 @@ def _apply_v(vector: Vector, rotation: Vector, second: Tensor, third: Tensor) ->
     return x, y, z
 
 
-def _plus(left: Vector, right: Vector) -> Vector:
-    return left[0] + right[0], left[1] + right[1], left[2] + right[2]
-
-
 def _coupling(
     translation: Vector, rotation: Vector, turned: Vector, across: Vector, second: Tensor, third: Tensor
 ) -> Vector:
@@ -229,7 +230,7 @@ def _coupling(
     once = cross(rotation, translation)
     twice = cross(rotation, once)
     spin = cross(turned, translation)
-    both = _plus(cross(rotation, spin), cross(turned, once))
+    both = plus(cross(rotation, spin), cross(turned, once))
     end = _apply_v(translation, rotation, second, third)
     away = cross(across, end)
     along = 2.0 * _combine("+++", rotation, turned)  # change of the squared angle

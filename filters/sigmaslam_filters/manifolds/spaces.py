@@ -24,7 +24,7 @@ from torch import Tensor
 
 from sigmaslam_filters.core.layout import concatenate, stack
 from sigmaslam_filters.manifolds import lie_groups
-from sigmaslam_filters.manifolds.lie_groups import Quaternion, Vector
+from sigmaslam_filters.manifolds.lie_groups import Quaternion, Vector, plus
 from sigmaslam_filters.manifolds.tangent_maps import TangentMaps, tangent_maps
 
 
@@ -343,7 +343,7 @@ class SE3(LieGroup):
     def push_retract(self, point: Tensor, change: Tensor) -> Tensor:
         """See `TangentMaps`."""
         (start, turned), (moved, added) = _rigid(point), _twist(change)
-        step = lie_groups.rotate(turned, moved) if self.side == "right" else _sum(moved, lie_groups.cross(added, start))
+        step = lie_groups.rotate(turned, moved) if self.side == "right" else plus(moved, lie_groups.cross(added, start))
         return stack([*step, *_turned(self.side, turned, added)])
 
     def push_local(self, point: Tensor, change: Tensor) -> Tensor:
@@ -475,10 +475,6 @@ def _turning(side: str, point: Quaternion, change: Quaternion) -> Vector:
 def _planar(tangent: Tensor) -> tuple[lie_groups.Pair, Tensor]:
     u, v, angle = tangent.unbind(-1)
     return (u, v), angle
-
-
-def _sum(left: Vector, right: Vector) -> Vector:
-    return left[0] + right[0], left[1] + right[1], left[2] + right[2]
 
 
 def _vector(tangent: Tensor) -> Vector:
