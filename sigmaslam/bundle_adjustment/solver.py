@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam, swap_tangent
-from sigmaslam.bundle_adjustment.structure import HUBER, Observations, offset_gradient, whitened_residuals
+from sigmaslam.bundle_adjustment.structure import HUBER, Observations, whitened_residuals
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, turn_covariance
 
@@ -136,7 +136,7 @@ class Solver:
 
         def gradient(solution: Solution) -> float:
             residuals, _ = whitened_residuals(self._observations, solution.poses, solution.points, solution.offset)
-            by_data = offset_gradient(self._observations, np.where(kept[:, None], residuals, 0.0))
+            by_data = float(np.sum(self._observations.whitening[:, :, 2] * np.where(kept[:, None], residuals, 0.0)))
             return by_data + solution.offset / prior_sigma**2
 
         solution = self.solve(kept, poses, points, offset)

@@ -85,11 +85,6 @@ def whitened_residuals(
     return _apply(observations.whitening, predicted - observations.measurement), in_front
 
 
-def offset_gradient(observations: Observations, residuals: np.ndarray) -> float:
-    """Derivative of half the sum of squared whitened residuals (O, 3) by the disparity offset."""
-    return float(np.sum(observations.whitening[:, :, 2] * residuals))
-
-
 def point_covariances(
     observations: Observations, kept: np.ndarray, poses: np.ndarray, points: np.ndarray
 ) -> np.ndarray:

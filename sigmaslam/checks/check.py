@@ -1,8 +1,9 @@
 """All checks of a stereo sequence from a few of its frames."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from sigmaslam.checks.calibration import check_calibration
@@ -24,11 +25,8 @@ SAMPLES_BEFORE_TRACKING = 4
 # An image that was turned or mirrored gives so many times the matches once that is undone.
 _BETTER = 3.0
 _INTRINSICS = {"principal point", "focal length"}
-_TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "mirrored left to right": lambda image: image[:, ::-1],
-    "mirrored top to bottom": lambda image: image[::-1],
-    "turned by 180 degrees": lambda image: image[::-1, ::-1],
-}
+# Of `cv2.flip`.
+_TURNS = {"mirrored left to right": 1, "mirrored top to bottom": 0, "turned by 180 degrees": -1}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +137,9 @@ def _check_overlap(matches: EyeMatches, steps: Sequence[FrameStep], matcher: Eye
     if count >= MIN_MATCHES:
         return Finding("overlap", "ok", f"{count} matches between the eyes in the median pair", count)
     # The pair with the median count stands for all.
-    step = steps[int(np.argsort(counts)[len(counts) // 2])]
-    turned = {what: matcher.count_turned(step, turn) for what, turn in _TURNS.items()}
+    frame, _ = steps[int(np.argsort(counts)[len(counts) // 2])]
+    undone = {what: replace(frame, right=cv2.flip(frame.right, turn)) for what, turn in _TURNS.items()}
+    turned = {what: len(matcher.match([(each, None)])) for what, each in undone.items()}
     what = max(turned, key=lambda each: turned[each])
     if turned[what] >= max(MIN_MATCHES, _BETTER * count):
         message = (
@@ -148,7 +147,7 @@ def _check_overlap(matches: EyeMatches, steps: Sequence[FrameStep], matcher: Eye
             "turned back: undo it in the one of the two that is wrong"
         )
         return Finding("mirrored", "error", message, turned[what])
-    keypoints = matcher.count_keypoints(step)
+    keypoints = matcher.count_keypoints(frame)
     cure = (
         "do both cameras see the same, and are the images of one time?"
         if keypoints >= 2 * MIN_MATCHES

@@ -1,6 +1,6 @@
 """Matches between the two eyes, searched in the whole image so that wrong rows and swapped eyes show."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -12,7 +12,7 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.lucas_kanade import follow_both_ways
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.readers.stereo_sequence import FrameStep
+from sigmaslam.readers.stereo_sequence import FrameStep, StereoFrame
 from sigmaslam.table import Table
 
 _KEYPOINTS = 512
@@ -70,17 +70,9 @@ class EyeMatcher:
         """Matches of the first frame of each step, and their motion to the second."""
         return EyeMatches.concatenate([self._match_pair(pair, step) for pair, step in enumerate(steps)])
 
-    def count_keypoints(self, step: FrameStep) -> int:
+    def count_keypoints(self, frame: StereoFrame) -> int:
         """Number of keypoints in the left image."""
-        first, _ = step
-        return len(self._detect(self.rectifier.rectify(first.left, first.right)[0]).keypoints)
-
-    def count_turned(self, step: FrameStep, turn: Callable[[np.ndarray], np.ndarray]) -> int:
-        """Number of matches where the right image is changed first."""
-        first, _ = step
-        left, right = self.rectifier.rectify(first.left, np.ascontiguousarray(turn(first.right)))
-        features = self._detect(left), self._detect(right)
-        return len(match_features(self._estimator, left, right, *features, MIN_PROBABILITY).probability)
+        return len(self._detect(self.rectifier.rectify(frame.left, frame.right)[0]).keypoints)
 
     def _match_pair(self, pair: int, step: FrameStep) -> EyeMatches:
         first, second = step

@@ -148,11 +148,12 @@ def find_worlds(
 def _guesses(readings: PosedReadings, G: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """First guesses of A and B: from positions with the sensor at the origin, and from the rotations of both."""
     places, positions = G[:, :3, 3], readings.positions
-    rotations = [_rotation_between(places - places.mean(axis=0), positions - positions.mean(axis=0))]
+    # Of vectors the nearest rotation to the products is that of least squares.
+    rotations = [nearest_rotation((positions - positions.mean(axis=0)).T @ (places - places.mean(axis=0)))]
     if readings.rotations is not None:
         of_carrier = rotation_log(G[:, :3, :3] @ G[0, :3, :3].T)
         of_sensor = rotation_log(readings.rotations @ readings.rotations[0].T)
-        rotations.append(_rotation_between(of_carrier, of_sensor))
+        rotations.append(nearest_rotation(of_sensor.T @ of_carrier))
     guesses = []
     for R in rotations:
         A, B = rigid_motion(R, positions.mean(axis=0) - R @ places.mean(axis=0)), np.eye(4)
@@ -161,11 +162,6 @@ def _guesses(readings: PosedReadings, G: np.ndarray) -> list[tuple[np.ndarray, n
             B[:3, :3] = nearest_rotation(mounts.mean(axis=0))
         guesses.append((A, B))
     return guesses
-
-
-def _rotation_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) that takes the first vectors (N, 3) to the second, in least squares."""
-    return nearest_rotation(second.T @ first)
 
 
 def _solve(

@@ -88,15 +88,9 @@ def train_scoring(out: Path, config: ScoringConfig, workers: int) -> dict[str, A
         scorer = train_scorer(sets, config.steps, config.seed, out / _SCORER_CHECKPOINT, told)
         clock.seconds()
         metrics = _scorer_metrics(scorer, folders[1])
-        rows = [
-            _collect(progress, folder, lambda records, note: collect_rows(records, scorer, note)) for folder in folders
-        ]
+        rows = _collect(progress, folders, lambda records, note: collect_rows(records, scorer, note))
         verifier = _train_verifier(progress, out / VERIFIER_NAME, config, rows, metrics, "")
-        seed = config.seed
-        rows = [
-            _collect(progress, folder, lambda records, note: collect_place_rows(records, seed, note))
-            for folder in folders
-        ]
+        rows = _collect(progress, folders, lambda records, note: collect_place_rows(records, config.seed, note))
         place_verifier = _train_verifier(progress, out / PLACE_VERIFIER_NAME, config, rows, metrics, "place_")
     networks = {"scorer": scorer, "verifier": verifier, "place_verifier": place_verifier}
     card = _make_card(origin, config, networks, metrics, clock.seconds())
@@ -146,11 +140,14 @@ def _make_records(progress: Progress, folder: Path, seed: int, count: int, worke
 
 def _collect(
     progress: Progress,
-    paths: list[Path],
+    folders: list[list[Path]],
     collect: Callable[[Iterator[PairRecord], Callable[[int], None]], VerifierRows],
-) -> VerifierRows:
-    task = progress.add_task("refining matches", total=len(paths), note="")
-    return collect(map(load_record, paths), lambda done: progress.update(task, completed=done))
+) -> list[VerifierRows]:
+    def of(paths: list[Path]) -> VerifierRows:
+        task = progress.add_task("refining matches", total=len(paths), note="")
+        return collect(map(load_record, paths), lambda done: progress.update(task, completed=done))
+
+    return [of(paths) for paths in folders]
 
 
 def _train_verifier(
