@@ -169,7 +169,12 @@ class Linearisation:
 
         offsets = columns if measurement.additive else block_diagonal(columns, noise.factor())
         if isinstance(transform, Taylor) and transform.jacobian is None:
-            seen = self._see(measurement, mean, shift, offsets, size, inputs)
+            at, slopes = self._differentiate(measurement, mean, shift, offsets, size, inputs)
+            expected, reference, residual = at, None, measurement.residual
+            if residual is not None:
+                values, slopes = push_forward(lambda z: residual(z, at), [at + torch.zeros_like(slopes)], [slopes])
+                expected, reference = values[0], at
+            seen = Transformed(reference, expected, Columns(slopes.movedim(0, -1)))
         else:
             seen = transform(evaluate, offsets, measurement.residual)
         if seen.mean.shape[-1] != value.shape[-1]:
@@ -220,23 +225,6 @@ class Linearisation:
                 lambda x, w: model.evaluate(x, w, *inputs), [points, torch.zeros_like(noise)], [along, noise]
             )
         return values[0], slopes
-
-    def _see(
-        self,
-        measurement: MeasurementModel,
-        mean: Tensor,
-        shift: Tensor | None,
-        columns: Tensor,
-        size: int,
-        inputs: tuple[Tensor, ...],
-    ) -> Transformed:
-        """What a measurement is expected to be, and its changes; arguments as `_differentiate`."""
-        value, slopes = self._differentiate(measurement, mean, shift, columns, size, inputs)
-        residual = measurement.residual
-        if residual is None:
-            return Transformed(None, value, Columns(slopes.movedim(0, -1)))
-        offset, slopes = push_forward(lambda z: residual(z, value), [value + torch.zeros_like(slopes)], [slopes])
-        return Transformed(value, offset[0], Columns(slopes.movedim(0, -1)))
 
     def _error(self, measurement: MeasurementModel, columns: Columns, size: int) -> _Error | None:
         """Makes the error of a linearisation, as far as the transform can see any; None: as good as none."""

@@ -207,7 +207,8 @@ def test_every_operation_is_that_of_torch(dtype):
     x[0, 0], x[1, 0], y[2, 1], x[3, 0], y[4, 0] = torch.nan, torch.inf, torch.nan, 0.0, x[4, 0]
     state = random_numbers(2, seed=2).to(dtype)
     scalar = ScalarStep(step, [state[0], state[0], x[0, 0], y[0, 0]])
-    plan = Plan([CompiledStep.of(scalar, range(5))], torch.zeros(7).long(), torch.arange(7), [2], scalar.outputs)
+    steps = [CompiledStep(scalar.source, range(5), scalar.adjoint_source)]
+    plan = Plan(steps, torch.zeros(7).long(), torch.arange(7), [2], scalar.outputs)
     states, _, numbers, flags, counts = run_sequence(plan, [state, state], [[x, y]])
     tolerance = 1e-13 if dtype == torch.float64 else 1e-5
     for k in range(7):
@@ -254,7 +255,8 @@ def test_every_derivative_is_that_of_torch(dtype):
     state = random_numbers(2, seed=2).to(dtype)
     given = [each.clone().requires_grad_() for each in (state, state, x, y)]
     scalar = ScalarStep(step, [state[0], state[0], x[0, 0], y[0, 0]])
-    plan = Plan([CompiledStep.of(scalar, range(3))], torch.zeros(6).long(), torch.arange(6), [2], scalar.outputs)
+    steps = [CompiledStep(scalar.source, range(3), scalar.adjoint_source)]
+    plan = Plan(steps, torch.zeros(6).long(), torch.arange(6), [2], scalar.outputs)
     found = run_sequence(plan, given[:2], [given[2:]])
     first, second, rows = given[0], given[1], []
     for k in range(6):

@@ -207,7 +207,8 @@ class CompiledFilter:
                 with torch.no_grad():
                     step(*ones)  # says what does not fit
                 try:
-                    self._scalar_steps[key] = CompiledStep.of(ScalarStep(step, ones), group.kind.slots)
+                    scalar = ScalarStep(step, ones)
+                    self._scalar_steps[key] = CompiledStep(scalar.source, group.kind.slots, scalar.adjoint_source)
                 except ScalarStepError as error:
                     _log.info("a loop around compiled steps, because %s", error)
                     self._scalar_steps[key] = None

@@ -129,11 +129,7 @@ def streams_of(events: Sequence[Event]) -> list[Stream]:
     for k, event in enumerate(events):
         shape = None if event.value is None else event.value.shape
         key = id(event.motion), id(event.measurement), event.gate, event.robust, shape
-        places = alike.get(key)
-        if places is None:
-            alike[key] = [k]
-        else:
-            places.append(k)
+        alike.setdefault(key, []).append(k)
     streams = []
     for places in alike.values():
         mine = [events[k] for k in places]

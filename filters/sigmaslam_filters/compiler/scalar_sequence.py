@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 from torch._inductor.codecache import CppCodeCache
 
-from sigmaslam_filters.compiler.scalar_step import ScalarStep
-
 # Of each element and time: the kind's step, with pointers to the state before, to its inputs and to its results.
 _DRIVER = """#include <cstdint>
 typedef void (*Step)(const void* const*, void* const*);
@@ -68,11 +66,6 @@ class CompiledStep:
         self.slots = slots
         self._source, self._adjoint_source = source, adjoint_source
         self._functions: dict[tuple[bool, ...], Any] = {}
-
-    @classmethod
-    def of(cls, scalar: ScalarStep, slots: Sequence[int]) -> "CompiledStep":
-        """Of a step that was traced, with derivatives."""
-        return cls(scalar.source, slots, scalar.adjoint_source)
 
     def step(self) -> Any:
         """The C function."""

@@ -41,9 +41,9 @@ class Noise(ABC):
         parts = self.covariance().unflatten(-1, (-1, size)).unflatten(-3, (-1, size))
         return torch.diagonal(parts, dim1=-4, dim2=-2).movedim(-1, -3)
 
-    @abstractmethod
     def variance(self) -> Tensor:
         """Diagonal of R, (..., m)."""
+        return torch.diagonal(self.covariance(), dim1=-2, dim2=-1)
 
     def log_determinant(self) -> Tensor:
         """log |R|, (...,)."""
@@ -177,10 +177,6 @@ class Dense(Noise):
     def covariance(self) -> Tensor:
         """R, (..., m, m)."""
         return self._covariance
-
-    def variance(self) -> Tensor:
-        """Diagonal of R, (..., m)."""
-        return torch.diagonal(self._covariance, dim1=-2, dim2=-1)
 
     def factor(self) -> Tensor:
         """Lower triangular root of R, (..., m, m); NaN where R is not positive semidefinite."""
