@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sigmaslam.bounded_files import CALIBRATION_BYTES, read_text
-from sigmaslam.calibration_files.camera_infos import is_camera_info, read_camera_infos
+from sigmaslam.calibration_files.camera_infos import is_camera_info, read_camera_info, stereo_from_infos
 from sigmaslam.calibration_files.euroc_calibration import read_sensors
 from sigmaslam.calibration_files.four_seasons_calibration import UNDISTORTED, read_four_seasons
 from sigmaslam.calibration_files.kalibr_calibration import is_kalibr, read_kalibr
@@ -139,7 +139,8 @@ def _read_pair(
     if any(is_file_storage(text) for text in texts):
         return read_opencv(paths, image_size, rectified)
     if all(is_camera_info(CalibrationYaml.read(path)) for path in paths):
-        return read_camera_infos(paths, rectified)
+        left, right = (read_camera_info(CalibrationYaml.read(path)) for path in paths)
+        return stereo_from_infos(left, right, rectified)
     raise CalibrationError(
         f"{paths[0]} and {paths[1]}: not the calibrations of two eyes; looked for camera_matrix of ROS, T_BS of EuRoC, "
         "and OpenCV's intrinsics.yml,extrinsics.yml"

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -96,13 +95,3 @@ def read_camera_info(content: CalibrationYaml) -> CameraInfo:
         R=content.section("rectification_matrix").numbers("data", (9,)).reshape(3, 3),
         P=content.section("projection_matrix").numbers("data", (12,)).reshape(3, 4),
     )
-
-
-def read_camera_infos(paths: tuple[Path, Path], rectified: bool) -> StereoCamera:
-    """Stereo camera of the files of both eyes, left first.
-
-    Raises:
-        CalibrationError: names file, key and what was expected.
-    """
-    left, right = (read_camera_info(CalibrationYaml.read(path)) for path in paths)
-    return stereo_from_infos(left, right, rectified)
