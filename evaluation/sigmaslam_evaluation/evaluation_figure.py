@@ -101,18 +101,6 @@ def _draw_segments(panel: "Axes", lengths: np.ndarray, by_length: np.ndarray, me
     panel.legend(fontsize=8, loc="best")
 
 
-def view_axes(positions: np.ndarray) -> tuple[int, int, int]:
-    """Axes of a view from above: the two along which the positions (N, 3) extend most, then the third.
-
-    For a camera that drives with z forward and y down these are x, z and y.
-    """
-    extent = np.ptp(positions, axis=0) if len(positions) else np.zeros(3)
-    # For equal extents the height is y, the axis that points down in a level camera.
-    height = min((1, 2, 0), key=lambda axis: float(extent[axis]))
-    horizontal, vertical = (axis for axis in range(3) if axis != height)
-    return horizontal, vertical, height
-
-
 def plot_trajectory(
     axes: "Axes", trajectories: Mapping[str, Trajectory], predicted: Mapping[str, np.ndarray] | None = None
 ) -> tuple[int, int, int]:
@@ -123,9 +111,14 @@ def plot_trajectory(
         trajectories: by label; the first determines the plane of the view.
         predicted: by label, (N,) bool, which poses no image confirms; a trajectory that is not named has none.
     Returns:
-        The axes of the view (see `view_axes`).
+        The axes of the view: the two along which the first trajectory extends most, then the third. For a camera that
+        drives with z forward and y down these are x, z and y.
     """
-    horizontal, vertical, height = view_axes(next(iter(trajectories.values())).positions)
+    positions = next(iter(trajectories.values())).positions
+    extent = np.ptp(positions, axis=0) if len(positions) else np.zeros(3)
+    # For equal extents the height is y, the axis that points down in a level camera.
+    height = min((1, 2, 0), key=lambda axis: float(extent[axis]))
+    horizontal, vertical = (axis for axis in range(3) if axis != height)
     plane = [horizontal, vertical]
     for number, (label, trajectory) in enumerate(trajectories.items()):
         colour = SERIES[number % len(SERIES)]

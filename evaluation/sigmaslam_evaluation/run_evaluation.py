@@ -111,7 +111,9 @@ def evaluate_run(
     true, left_out = (true, None) if of_truth is None else (kept, left_out)
     relative = _judge_relative_poses(run_or_trajectory, estimate, true, of_truth, follows_object) if is_run else None
     if follows_object:
-        T_body_followed = _followed_frame(estimate, true)
+        # What the run follows lies to the body of the truth as the first pair of poses has them, both in the camera.
+        followed, body = (each.poses[0] for each in synchronise(estimate, true))
+        T_body_followed = se3_inverse(body) @ followed
         true = Trajectory(true.timestamps, true.poses @ T_body_followed)
         of_truth = None if of_truth is None else of_truth.turned(se3_inverse(T_body_followed))
     path = run_or_trajectory / "covariance.npy"  # of a run alone
@@ -238,15 +240,6 @@ def _follows_object(run: Path) -> bool:
         return "object" in json.loads(read_text(run / "run.json", TABLE_BYTES, "the run"))
     except (InputError, ValueError, RecursionError, TypeError):
         return False
-
-
-def _followed_frame(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
-    """T_body_followed (4, 4): the frame that the run follows, in that on the body whose poses are the truth.
-
-    The first pair of poses has them to each other. The fixed frame is the camera's in both.
-    """
-    estimate_index, truth_index = associate(estimate, truth)
-    return np.asarray(se3_inverse(truth.poses[truth_index[0]]) @ estimate.poses[estimate_index[0]])
 
 
 def _frame_count(frames: FrameTable | None, estimate: Trajectory, truth: Trajectory, matched: int) -> int:

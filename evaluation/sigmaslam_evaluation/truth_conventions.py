@@ -107,14 +107,10 @@ def find_convention(
         None where no other makes the error collapse.
     """
     now = absolute_trajectory_error(estimate, given.apply(truth), "origin")
-    candidates = [
-        replace(given, frame=frame, inverse=inverse, quaternion=quaternion, unit=unit)  # type: ignore[arg-type]
-        for frame, inverse, quaternion, unit in product(
-            ("camera", "body"), (False, True), ("xyzw", "wxyz") if has_quaternions else ("xyzw",), ("m", "mm")
-        )
-    ]
+    orders = ("xyzw", "wxyz") if has_quaternions else ("xyzw",)
     found: list[tuple[float, TruthConvention]] = []
-    for candidate in candidates:
+    for frame, inverse, quaternion, unit in product(("camera", "body"), (False, True), orders, ("m", "mm")):
+        candidate = replace(given, frame=frame, inverse=inverse, quaternion=quaternion, unit=unit)  # type: ignore[arg-type]
         error = absolute_trajectory_error(estimate, candidate.apply(truth), "origin")
         if error.rmse < COLLAPSE * now.rmse and error.rotation_rmse_deg <= now.rotation_rmse_deg:
             found.append((error.rmse, candidate))
