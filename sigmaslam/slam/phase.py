@@ -3,6 +3,8 @@
 from enum import Enum, auto
 from math import inf
 
+import numpy as np
+
 
 class Phase(Enum):
     """A tracker that is lost stays in its phase."""
@@ -21,6 +23,7 @@ class Course:
         timestamp: of the last frame, seconds; None before the first.
         waiting_since: time stamp of the first view that could be a keyframe, blurred or not, seconds.
         started_at, tracked_at: time stamps of the first keyframe and of the last pose.
+        found: pose (4, 4) of the last view that was found by a keyframe, T_world_camera, and its time stamp, seconds.
         is_shifted: the last pair showed a bump, and was skipped: that stays, an image gone wrong is one alone.
     """
 
@@ -29,6 +32,7 @@ class Course:
         self.timestamp: float | None = None
         self.waiting_since, self.is_shifted = inf, False
         self.started_at = self.tracked_at = 0.0
+        self.found = np.eye(4), -inf
 
     def start(self, timestamp: float) -> None:
         """There is a first keyframe."""

@@ -1,7 +1,7 @@
 """Tracking begins, begins again, or goes on from a view whose velocity is unknown."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from sigmaslam.estimation.calibration_correction import change_rig
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
-from sigmaslam.geometry.se3 import se3_body, se3_log, turn_covariance
+from sigmaslam.geometry.se3 import se3_body, se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.keyframes import Keyframes
@@ -86,15 +86,23 @@ class Recovery:
         since = self.course.waiting_since = min(timestamp, self.course.waiting_since)
         return timestamp - since < self.config.lost_seconds and view.is_blurred
 
-    def resume(self, found: Relocalisation, timestamp: float) -> KeyframeTracks:
-        """Goes on from where a lost view was found."""
+    def resume(self, found: Relocalisation, timestamp: float, delay: float) -> KeyframeTracks | None:
+        """Goes on from where a lost view was found; with a late right eye from the second one, by their motion."""
+        (before, since), self.course.found = self.course.found, (found.pose, timestamp)
+        twist = None
+        if delay:
+            if timestamp - since > self.config.lost_seconds:
+                return None
+            twist = se3_log(se3_inverse(before) @ found.pose) / (timestamp - since)
+            way = delay * (twist - self.motion.twist)  # the view is corrected by that already
+            found = replace(found, view=at_one_moment(found.view, self.window.camera, way))
         if dead_reckoning(self.motion) is not None:
             self.course.track(timestamp)
         else:
             self.course.resume(timestamp)
         covariance = turn_covariance(found.pose, found.covariance)
         new = NewKeyframe(found.view, timestamp, found.pose, found.pose, covariance, origin=found.origin)
-        return self._insert(new)
+        return self._insert(new, twist)
 
     def go_on_after_bump(self, change: RigChange, view: StereoView, timestamp: float) -> KeyframeTracks | None:
         """Begins a window anew where the left camera is, with a calibration of which little is known.
@@ -108,9 +116,9 @@ class Recovery:
             self.keyframes.marginalise_oldest(spare=last)
         change_rig(self.window, change.columns)
         # As if all that is remembered had been seen since.
-        known = *(each.view for each in self.keyframes.remembered), *(k.packed for k in self.keyframes.hanging.values())
-        for view in known:
-            view.disparity[:] += change.columns
+        hanging = (each.packed.disparity for each in self.keyframes.hanging.values())
+        for disparity in (*(each.view.disparity for each in self.keyframes.remembered), *hanging):
+            disparity += change.columns
         self.course.track(timestamp)
         pose, origin = change.fit.pose, self.keyframes.index(last.id)
         new = NewKeyframe(view, timestamp, pose, pose, change.fit.relative, origin=origin, rig_changed=True)
@@ -144,8 +152,10 @@ class Recovery:
         view = view.only(self.admission.admit(view, pose, self.window))
         return self._insert(NewKeyframe(view, timestamp, pose, pose, covariance))
 
-    def _insert(self, new: NewKeyframe) -> KeyframeTracks:
-        """Makes a view a keyframe that sees no known landmark; its velocity is unknown."""
+    def _insert(self, new: NewKeyframe, twist: np.ndarray | None = None) -> KeyframeTracks:
+        """Makes a view a keyframe that sees no known landmark; its velocity is hardly known."""
         tracks = self.mapper.insert(new)
-        self.motion.set_twist(np.zeros(6), self.config.initial_twist_sigma(self.window.depth))
+        self.motion.set_twist(
+            np.zeros(6) if twist is None else twist, self.config.initial_twist_sigma(self.window.depth)
+        )
         return tracks

@@ -129,7 +129,7 @@ class StereoTracker:
         self._frontend = frontend = load()
         update = FrameUpdate(window, config.iterations, bool(motion.sensors))
         guided = GuidedMatcher(rectified, frontend, window, update, noise, config, not right_delay)
-        self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config)
+        self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config, bool(right_delay))
         self._follower = follower = LandmarkFollower(guided)
         self._localiser = localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
         self._scrutiny = Scrutiny(localiser, self._clock, admission.moving, disparity_error is not None)
@@ -224,8 +224,8 @@ class StereoTracker:
             tracks = self._recovery.go_on_after_bump(change, frame.view, timestamp)
             status = "lost" if tracks is None else doubts.status
         elif (found := self._relocaliser.relocalise(frame.view, self._clock.after_gap)) is not None:
-            status = "relocalised"
-            tracks = self._recovery.resume(found, timestamp)
+            tracks = self._recovery.resume(found, timestamp, self._delay)
+            status = self._recovery.status if tracks is None else "relocalised"
         else:
             status = self._recovery.status
             tracks = self._recovery.start_or_recover(frame.view, timestamp)

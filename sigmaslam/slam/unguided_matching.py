@@ -30,6 +30,7 @@ class UnguidedMatcher:
     Attributes:
         window: whose calibration corrects the disparities.
         noise: of what is matched.
+        is_late: right eyes are; by an unknown velocity disparities of a view that is found are wrong, and not used.
     """
 
     camera: RectifiedStereo
@@ -37,6 +38,7 @@ class UnguidedMatcher:
     window: KeyframeWindow
     noise: MeasurementNoise
     config: TrackerConfig
+    is_late: bool = False
 
     def relative_pose_to(
         self, key: StereoView, view: StereoView, excludes: Callable[[np.ndarray], bool] | None = None
@@ -66,6 +68,8 @@ class UnguidedMatcher:
         little agrees at first, as after a long way ahead, the search finds more, and in places that are less wrong.
         Errors that neighbours share, and those of the calibration, are in the covariance.
         """
+        if self.is_late:
+            view = replace(view, disparity=np.full_like(view.disparity, np.nan))
         first = self.relative_pose_to(key, view)
         if first is None:
             return None

@@ -29,6 +29,7 @@ from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam.two_view.stereo_pose import RelativePose
+from sigmaslam_benchmarks.live.driver_faults import delay_right
 from tests.support.dense_window import NO_WALK, make_window
 from tests.support.estimates import Demo, error_of, mirrored, squared_error
 from tests.support.faults import assert_no_pose
@@ -517,6 +518,19 @@ def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
     errors = se3_log(se3_inverse(final.poses) @ truth[10:16])
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.01
     assert squared_sigmas(errors, covariances).max() < WITHIN_3_SIGMA
+
+
+@pytest.mark.long
+def test_a_late_right_eye_finds_its_place_in_a_map(demo: Demo, demo_run: Path):
+    """Disparities of a view are wrong by a velocity that two views show, once both are found."""
+    (camera, frames, truth), delay = demo, 0.04
+    tracker = StereoTracker(camera, right_delay=delay)
+    tracker.load_map(demo_run / "map.npz")
+    late = delay_right(1e3 * delay, frames, np.random.default_rng(0))[10:18]
+    estimates = [tracker.step(each.left, each.right, each.timestamp) for each in late]
+    assert [each.status for each in estimates] == ["starting", "relocalised", *["tracking"] * 6]
+    for estimate, true in zip(estimates[1:], truth[11:18], strict=True):
+        assert squared_error(estimate, true) < WITHIN_3_SIGMA
 
 
 @pytest.mark.slow
