@@ -63,6 +63,14 @@ def read_text(path: Path, limit: int, what: str, error: type[InputError] = Input
         ) from None
 
 
+def table_lines(path: Path, what: str) -> Iterator[tuple[int, str]]:
+    """Stripped lines of a table that are neither empty nor comments, each with its number from 1; as `read_text`."""
+    for number, line in enumerate(read_text(path, TABLE_BYTES, what).splitlines(), start=1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith("#"):
+            yield number, stripped
+
+
 def read_json(path: Path, what: str, mend: str, error: type[InputError] = InputError, limit: int = TABLE_BYTES) -> Any:
     """The content of a JSON file.
 

@@ -14,20 +14,19 @@ from sigmaslam.errors import InputError
 from sigmaslam.estimation.gaussian import matrix_root
 from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse
-from sigmaslam.readers.pairing import is_stamp
+from sigmaslam.readers.pairing import stamps_of
 
 
 def image_times(names: Sequence[str]) -> np.ndarray:
-    """(N,) seconds of images that are named by their time in nanoseconds, as those of `board_images` of both eyes.
+    """(N,) seconds of images that are named by their time since 1970, as those of `board_images` of both eyes.
 
     Raises:
         InputError: a name is no time.
     """
-    stems = [Path(name.split(" + ")[0]).stem for name in names]
-    wrong = [name for name, stem in zip(names, stems, strict=True) if not is_stamp(stem)]
-    if wrong:
-        raise InputError(f"{wrong[0]}: with --imu images are named by their time in nanoseconds, as EuRoC's cam0/data")
-    return np.array([int(stem) / 1e9 for stem in stems])
+    stamps = stamps_of([Path(name.split(" + ")[0]).stem for name in names])
+    if stamps is None:
+        raise InputError(f"{names[0]}, ...: with --imu all names are times in nanoseconds, as in EuRoC's cam0/data")
+    return np.array([stamp / 1e9 for stamp in stamps])
 
 
 def board_path(result: BoardCalibration) -> CameraPath:

@@ -20,10 +20,8 @@ LOOKED_FOR = (
 
 def find_asl_root(folder: Path) -> Path | None:
     """The folder that has cam0/data and cam1/data, if there is one."""
-    for root in (folder, folder / "mav0"):
-        if (root / "cam0" / "data").is_dir() and (root / "cam1" / "data").is_dir():
-            return root
-    return None
+    roots = (folder, folder / "mav0")
+    return next((each for each in roots if all((each / eye / "data").is_dir() for eye in ("cam0", "cam1"))), None)
 
 
 def is_flat(folder: Path) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES, ImagePairs
 from sigmaslam.readers.kitti import common_size
-from sigmaslam.readers.pairing import default_times, is_stamp, list_images, pair_by_name, pair_by_stamp, read_times
+from sigmaslam.readers.pairing import default_times, pair_by_name, pair_by_stamp, read_times, stamped_images
 from sigmaslam.readers.stereo_sequence import StereoSequence
 from sigmaslam.readers.video import beside_calibration, find_videos, open_video
 
@@ -30,7 +30,7 @@ def open_folder(folder: Path, calibration: Path | None = None) -> StereoSequence
     """Open left and right images with the calibration in the folder, of any form, or the one given.
 
     Images are paired by the numbers in their names. Times come from times.txt (seconds, a line per pair),
-    else from names that are nanoseconds (then the pairing is by time, to 5 ms), else 10 Hz with a warning.
+    else from names that are times since 1970 (then the pairing is by time, to 5 ms), else 10 Hz with a warning.
 
     Raises:
         InputError: a sub-folder is missing, the left and right images differ, or the times do not fit.
@@ -44,10 +44,9 @@ def open_folder(folder: Path, calibration: Path | None = None) -> StereoSequence
     left, right = eyes
     prefixes = ("left", "right") if left == right else ("", "")
     times = folder / "times.txt"
-    images = [list_images(eye) for eye in (left, right)]
-    if not times.is_file() and all(is_stamp(path.stem) for side in images for path in side):
-        stamps = [{int(path.stem): path for path in side} for side in images]
-        files, timestamps = pair_by_stamp(stamps[0], stamps[1], folder)
+    left_stamps, right_stamps = (stamped_images(eye) for eye in eyes)
+    if not times.is_file() and left_stamps is not None and right_stamps is not None:
+        files, timestamps = pair_by_stamp(left_stamps, right_stamps, folder)
     else:
         files, whole = pair_by_name(left, right, prefixes)
         if times.is_file():

@@ -27,13 +27,10 @@ def open_four_seasons(folder: Path, calibration: Path | None = None) -> StereoSe
     """
     if not has_undistorted_images(folder):
         raise InputError(f"{folder}: not a recording of 4Seasons; looked for {LOOKED_FOR}")
-    sides = []
-    for camera in ("cam0", "cam1"):
-        files = stamped_images(folder / "undistorted_images" / camera)
-        if files is None:
-            raise InputError(f"{folder}: names of images must be times in nanoseconds, such as 1602074877621449728.png")
-        sides.append(files)
-    pairs = ImagePairs(*pair_by_stamp(sides[0], sides[1], folder), folder)
+    left, right = (stamped_images(folder / "undistorted_images" / camera) for camera in ("cam0", "cam1"))
+    if left is None or right is None:
+        raise InputError(f"{folder}: names of images must be times in nanoseconds, such as 1602074877621449728.png")
+    pairs = ImagePairs(*pair_by_stamp(left, right, folder), folder)
     path = calibration or _find_undistorted(folder)
     return StereoSequence(pairs, read_calibration(path, common_size(pairs.first_pair)), folder, "4seasons")
 

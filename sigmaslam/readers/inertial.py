@@ -54,11 +54,8 @@ InertialRecording = SensorRecording[InertialSensor, InertialSamples]
 
 def find_imu(folder: Path) -> Path | None:
     """The table of a EuRoC or TUM-VI folder, if it has one that says how the sensor is mounted."""
-    for root in (folder, folder / "mav0"):
-        table = root / "imu0" / "data.csv"
-        if table.is_file() and _find_mounting(table) is not None:
-            return table
-    return None
+    tables = (root / "imu0" / "data.csv" for root in (folder, folder / "mav0"))
+    return next((table for table in tables if table.is_file() and _find_mounting(table) is not None), None)
 
 
 def read_imu(path: Path, is_mounted: bool = True) -> InertialRecording:

@@ -6,13 +6,14 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from fractions import Fraction
 from math import isfinite
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, list_folder, read_text, shorten
+from sigmaslam.bounded_files import list_folder, shorten, table_lines
 from sigmaslam.errors import InputError
 from sigmaslam.readers.images import IMAGE_SUFFIXES
 from sigmaslam.table import nearest_rows
@@ -25,11 +26,13 @@ _UNREAD = frozenset({".gif", ".webp", ".heic", ".avif", ".jp2", ".exr", ".svg"})
 STAMP_TOLERANCE_NS = 5_000_000
 # A driver drops single images; where more than this share has no partner, folders or names are wrong.
 _MAX_ALONE = 0.1
-# Nanoseconds since 1970 have 19 digits; 16 also admit clocks with another origin.
-STAMP_DIGITS = 16
+# Seconds with decimals and milliseconds since 1970; of nanoseconds 16 digits also admit clocks with another origin.
+_STAMP = re.compile(r"\d{10}\.\d+|\d{13}|\d{16,}")
 _STAMPS = range(-(2**63), 2**63)
-# Seconds: times since 1970 in our century are smaller, and steps between pairs of a moving camera are shorter.
-_LATEST, _LONGEST_STEP = 4.1e9, 1e3
+# Seconds: times since 1970 in our century lie between these.
+_EARLIEST, _LATEST = 1e9, 4.1e9
+# Seconds from image to image: names are times at shorter steps, and times.txt is in milliseconds at longer ones.
+_LONGEST_STEP, _SLOWEST = 5.0, 20.0
 
 # At most so many images of one eye wait for a partner.
 MAX_WAITING = 50
@@ -110,15 +113,26 @@ def frame_numbers(files: Sequence[tuple[Path, Path]]) -> list[int] | None:
     return [int(stem) for stem in stems] if all(stem.isdecimal() for stem in stems) else None
 
 
-def is_stamp(stem: str) -> bool:
-    """Whether a file name is a time in nanoseconds."""
-    return stem.isdecimal() and len(stem) >= STAMP_DIGITS
+def stamps_of(stems: Sequence[str]) -> list[int] | None:
+    """Times in names of files as nanoseconds; None where a name is no time.
+
+    A name has nanoseconds, or, since 1970 and with steps as of a camera, seconds with decimals, milli- or microseconds.
+    """
+    if not all(map(_STAMP.fullmatch, stems)):
+        return None
+    times = list(map(Fraction, stems))
+    step = float(np.median(np.diff(np.array(sorted(times), np.float64)))) if len(times) > 1 else 0.0
+    for unit in (1, 1_000, 1_000_000):
+        if all(_EARLIEST * unit <= time <= _LATEST * unit for time in times) and step < _LONGEST_STEP * unit:
+            return [int(time * 1_000_000_000 / unit) for time in times]
+    return list(map(int, stems)) if all(stem.isdecimal() and len(stem) > 13 for stem in stems) else None
 
 
 def stamped_images(folder: Path) -> dict[int, Path] | None:
     """Images of a folder by the times in their names, nanoseconds; None where a name is no time."""
     files = list_images(folder)
-    return {int(path.stem): path for path in files} if all(is_stamp(path.stem) for path in files) else None
+    stamps = stamps_of([path.stem for path in files])
+    return None if stamps is None else dict(zip(stamps, files, strict=True))
 
 
 def pair_by_stamp(
@@ -228,14 +242,11 @@ def read_times(
     Raises:
         InputError: a line is no time, times do not increase or are no seconds, or the number of lines does not fit.
     """
-    lines = read_text(path, TABLE_BYTES, "the timestamps").splitlines()
     times: list[float] = []
     rows: list[int] = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
+    for number, line in table_lines(path, "the timestamps"):
         try:
-            times.append(parse_seconds(line.strip()))
+            times.append(parse_seconds(line))
         except (ValueError, OverflowError):
             raise InputError(f"{path}: line {number} is not a time in seconds: {shorten(repr(line))}") from None
         rows.append(number)
@@ -245,19 +256,19 @@ def read_times(
         if numbers is None or len(times) <= max(numbers):
             raise InputError(f"{path}: {len(times)} timestamps for {count} image pairs; one line per pair is needed")
         times, rows = [times[number] for number in numbers], [rows[number] for number in numbers]
-    _check_increase(path, times, rows)
-    return in_seconds(path, times)
+    check_increase(path, times, rows)
+    return in_seconds(path, times, _SLOWEST)
 
 
-def _check_increase(path: Path, times: Sequence[float], lines: Sequence[int]) -> None:
+def check_increase(path: Path, times: Sequence[float], lines: Sequence[int]) -> None:
     """Refuses times that are not finite, or not later than the one before; `lines` are their numbers in the file."""
     for k, (time, line) in enumerate(zip(times, lines, strict=True)):
         if not isfinite(time):
             raise InputError(f"{path}: line {line} is {time}: give a finite time in seconds")
         if k and time <= times[k - 1]:
             raise InputError(
-                f"{path}: line {line} is {time!r}, the time before is {times[k - 1]!r}: times must increase; correct "
-                "them, or sort images and times together"
+                f"{path}: line {line} is {time!r}, the time before is {times[k - 1]!r}: times must increase; sort the "
+                "lines by time (and images with them), and remove repeated ones"
             )
 
 
@@ -271,21 +282,23 @@ def parse_seconds(text: str) -> float:
     return datetime.fromisoformat(f"{date} {whole}+00:00").timestamp() + float(f"0.{decimals or 0}")
 
 
-def in_seconds(path: Path, times: Sequence[float]) -> list[float]:
+def in_seconds(path: Path, times: Sequence[float], longest_step: float = np.inf) -> list[float]:
     """The times, if they can be seconds; their unit is told by their size and by the median of their steps.
 
+    Args:
+        longest_step: seconds; longer ones are taken for milliseconds.
     Raises:
         InputError: they are so large or so far apart that they must be in nano-, micro- or milliseconds.
     """
     if not np.all(np.isfinite(times)) or not len(times):
         return list(times)
     largest, step = float(np.max(np.abs(times))), float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
-    for unit, factor in (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)):
-        # Seconds since 1970 have ten digits, and no pairs of a moving camera are a quarter of an hour apart.
-        if largest > 0.1 * factor * _LATEST or (factor > 1e3 and step > max(factor / 1e3, _LONGEST_STEP)):
+    # Seconds since 1970 have ten digits, and no pairs of a moving camera are a quarter of an hour apart.
+    for unit, factor, longest in (("nano", 1e9, 1e6), ("micro", 1e6, 1e3), ("milli", 1e3, longest_step)):
+        if largest > 0.1 * factor * _LATEST or step > longest:
             raise InputError(
-                f"{path}: times such as {times[0]:.0f}, {step:.6g} apart, look like {unit}: write seconds, the numbers "
-                f"divided by {factor:.0e}"
+                f"{path}: times such as {times[0]:.0f}, {step:.6g} apart, look like {unit}seconds: write seconds, the "
+                f"numbers divided by {factor:.0e}"
             )
     return list(times)
 

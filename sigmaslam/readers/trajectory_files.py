@@ -1,18 +1,19 @@
 """Trajectory files: TUM, KITTI and the ground truth of EuRoC."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from sigmaslam.bounded_files import TABLE_BYTES, finite_number, load_array, read_text, shorten
+from sigmaslam.bounded_files import finite_number, load_array, shorten, table_lines
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 from sigmaslam.geometry.se3 import matrix_to_quaternion, nearest_rotation, quaternion_to_matrix, rigid_motion
 from sigmaslam.geometry.trajectory import Trajectory
+from sigmaslam.readers.pairing import check_increase
 
 TrajectoryFormat = Literal["tum", "kitti", "euroc"]
 
@@ -29,7 +30,7 @@ def trajectory_format(path: str | Path) -> TrajectoryFormat:
         InputError: the file cannot be read, is empty, or has another number of columns.
     """
     path = Path(path)
-    for number, line in _lines(path):
+    for number, line in table_lines(path, "the trajectory"):
         if "," in line:
             return "euroc"
         columns = len(line.split())
@@ -85,7 +86,7 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     path = Path(path)
     rows, numbers = _numbers(path, columns=8, form="TUM: t x y z qx qy qz qw")
-    _check_increasing(path, rows[:, 0], numbers)
+    check_increase(path, rows[:, 0].tolist(), numbers)
     return Trajectory(rows[:, 0], _poses(path, rows[:, 1:4], rows[:, 4:8], numbers))
 
 
@@ -139,7 +140,7 @@ def read_kitti(path: str | Path) -> Trajectory:
             f"{path}: {len(rows)} poses, but {times} has {len(stamps)} times: give the times of these poses, "
             "or move the file away to assume 10 Hz"
         )
-    _check_increasing(times, stamps[:, 0], stamp_numbers)
+    check_increase(times, stamps[:, 0].tolist(), stamp_numbers)
     return Trajectory(stamps[:, 0], poses)
 
 
@@ -182,7 +183,7 @@ def read_euroc_truth(path: str | Path) -> Trajectory:
             f"{first + 7}: timestamp in ns, p_x, p_y, p_z, q_w, q_x, q_y, q_z"
         )
     timestamps = rows[:, 0] / 1e9
-    _check_increasing(path, timestamps, numbers)
+    check_increase(path, timestamps.tolist(), numbers)
     quaternions = rows[:, [first + 4, first + 5, first + 6, first + 3]]
     T_world_body = _poses(path, rows[:, first : first + 3], quaternions, numbers)
     return Trajectory(timestamps, T_world_body @ _camera_in_body(path))
@@ -204,20 +205,11 @@ def _camera_in_body(truth: Path) -> np.ndarray:
     return T_body_camera
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines that are neither empty nor comments, each with its number from 1."""
-    text = read_text(path, TABLE_BYTES, "the trajectory")
-    for number, line in enumerate(text.splitlines(), start=1):
-        stripped = line.strip()
-        if stripped and not stripped.startswith("#"):
-            yield number, stripped
-
-
 def _numbers(path: Path, columns: int | None, form: str, separator: str | None = None) -> tuple[np.ndarray, list[int]]:
     """All rows as (N, columns) float64 and their line numbers; None takes the columns of the first row."""
     rows: list[list[float]] = []
     numbers: list[int] = []
-    for number, line in _lines(path):
+    for number, line in table_lines(path, "the trajectory"):
         fields = line.split(separator)
         columns = len(fields) if columns is None else columns
         if len(fields) != columns:
@@ -233,16 +225,6 @@ def _numbers(path: Path, columns: int | None, form: str, separator: str | None =
     if not rows:
         raise InputError(f"{path}: holds no rows; expected {form}")
     return np.array(rows, dtype=np.float64), numbers
-
-
-def _check_increasing(path: Path, timestamps: np.ndarray, numbers: list[int]) -> None:
-    late = np.flatnonzero(np.diff(timestamps) <= 0)
-    if len(late):
-        k = late[0] + 1
-        raise InputError(
-            f"{path}: line {numbers[k]}: time {timestamps[k]:.9f} s does not follow "
-            f"{timestamps[k - 1]:.9f} s; sort the rows by time and remove repeated ones"
-        )
 
 
 def _poses(path: Path, positions: np.ndarray, quaternions: np.ndarray, numbers: list[int]) -> np.ndarray:

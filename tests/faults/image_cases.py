@@ -43,7 +43,6 @@ _GOES_ON = {
     "focal length in mm",
     "distortion of rectified images",
     "eyes exchanged in mid-run",
-    "times in ms",
 }
 _FIRST = {
     **dict.fromkeys(
@@ -68,7 +67,7 @@ _QUICK = {
 
 
 def _rig_case(name: str, fault: Fault) -> Case:
-    refused = name in ("times in us", "times in ns")
+    refused = name in ("times in ms", "times in us", "times in ns")
     return Case(
         "rig",
         name,

@@ -233,7 +233,7 @@ def test_the_command_names_what_is_missing(tmp_path: Path, real_data: Path):
     assert_refused(run_here("calibrate", tmp_path, "--imu", imu, "--out", out), "no trajectory.tum")
     board = real_data / "opencv_stereo_chessboard"
     refused = run_here("calibrate", board, "--board", "chessboard:9x6:0.025", "--imu", imu, "--out", out)
-    assert_refused(refused, "named by their time in nanoseconds")
+    assert_refused(refused, "all names are times in nanoseconds")
 
 
 @pytest.mark.slow

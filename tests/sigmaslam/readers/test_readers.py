@@ -454,6 +454,7 @@ def test_folder_times(tmp_path, caplog):
         ("1\ntwo\n3\n", "line 2 is not a time in seconds: 'two'"),
         ("1\n3\n3\n", "times.txt: line 3 is 3.0, the time before is 3.0: times must increase"),
         ("nan\n3\n4\n", "times.txt: line 1 is nan: give a finite time"),
+        ("0\n50\n100\n", r"times.txt: times such as 0, 50 apart, look like milliseconds: .* divided by 1e\+03"),
     ):
         (tmp_path / "times.txt").write_text(text)
         with pytest.raises(InputError, match=message):
@@ -469,6 +470,32 @@ def test_folder_names_that_are_stamps_give_the_times(tmp_path):
     sequence, frames = read_all(tmp_path)
     assert sequence.timestamps == [stamp / 10**9 for stamp in names]
     np.testing.assert_array_equal(frames[1].right, picture(1, 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "first"),
+    [
+        ("{:.6f}", 0.05, 1403636584.763556),
+        ("{:.0f}", 50, 1403636584763),
+        ("{:.0f}", 50_000, 1403636584763555),
+        ("{:.0f}", 50_000_000, 1403636584763555),
+    ],
+)
+def test_names_in_any_unit_since_1970_give_the_times(tmp_path, name, step, first):
+    """Sixteen digits with steps of 50 million are nanoseconds of a clock that started 16 days ago."""
+    make_folder(tmp_path, 0)
+    for index in range(3):
+        for eye, side in enumerate(("left", "right")):
+            cv2.imwrite(str(tmp_path / side / f"{name.format(first + index * step)}.png"), picture(index, eye))
+    times = open_sequence(tmp_path).timestamps
+    np.testing.assert_allclose(np.diff(times), 0.05, rtol=1e-5)
+    assert times[0] == first / (20 * step)
+
+
+def test_thirteen_digits_with_steps_of_no_clock_since_1970_are_frame_numbers(tmp_path, caplog):
+    make_folder(tmp_path, 3, name="14036365{}0000.png")
+    assert open_sequence(tmp_path).timestamps == [0.0, 0.1, 0.2]
+    assert "10 Hz" in messages(caplog)[0]
 
 
 # KITTI

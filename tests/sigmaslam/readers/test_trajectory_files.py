@@ -135,7 +135,7 @@ def test_euroc_sensor_file_without_extrinsics_is_named(tmp_path):
         ("0 0 0 0 0 0 0 1\n0.1 0 0 zero 0 0 0 1\n", r"line 2: 'zero' is not a finite number"),
         ("# c\n\n0 0 0 0 0 0 0 1\n0.1 0 0 nan 0 0 0 1\n", r"line 4: 'nan'"),
         ("0 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 1\n", r"line 2 has 7 columns, not 8"),
-        ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", r"line 2: time 0\.0+ s does not follow"),
+        ("0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", r"line 2 is 0\.0, the time before is 0\.0: times must increase"),
         ("0 0 0 0 0 0 0 1\n0.1 0 0 0 0 0 0 0\n", r"line 2: the quaternion has length 0"),
         ("1 2 3\n", r"line 1 has 3 columns"),
         ("# only a comment\n", r"holds no poses"),
@@ -197,12 +197,14 @@ def test_missing_folder_is_named(tmp_path):
 @pytest.mark.parametrize(("factor", "unit"), [(1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")])
 @pytest.mark.parametrize("origin", [0.0, 1.7e9])
 def test_times_in_another_unit_are_named(tmp_path, factor, unit, origin):
-    """Milliseconds from zero on could be seconds of a slow camera. A truth's unit is found by `evaluate`."""
+    """Milliseconds from zero on could be seconds between fixes. A truth's unit is found by `evaluate`."""
     path, times = tmp_path / "truth.tum", [round(factor * (origin + 0.1 * k)) for k in range(9)]
     path.write_text("".join(f"{time} {k} 0 0 0 0 0 1\n" for k, time in enumerate(times)))
     assert len(read_trajectory(path)) == 9
     if unit == "milliseconds" and not origin:
         assert in_seconds(path, times) == times
+        with pytest.raises(InputError, match="look like milliseconds"):
+            in_seconds(path, times, 20.0)
         return
     with pytest.raises(InputError, match=rf"truth\.tum: times such as .* look like {unit}: write seconds"):
         in_seconds(path, times)
