@@ -63,7 +63,7 @@ def list_images(folder: Path) -> list[Path]:
 def pair_by_name(
     left_folder: Path, right_folder: Path, prefixes: tuple[str, str] = ("", "")
 ) -> tuple[list[tuple[Path, Path]], np.ndarray]:
-    """Pairs of equal frame numbers (all the numbers in a name), in their order.
+    """Pairs of equal frame numbers (all the numbers in a name but the camera's), in their order.
 
     Where a name has no number, or a folder has the same numbers twice, whole names are compared. Images without partner
     are left out with one warning.
@@ -83,7 +83,7 @@ def pair_by_name(
         [path for path in list_images(folder) if path.name.startswith(prefix)]
         for folder, prefix in zip(folders, prefixes, strict=True)
     ]
-    keys: list[list[Key]] = [[tuple(map(int, re.findall(r"\d+", path.stem))) for path in side] for side in files]
+    keys = _frame_keys(files)
     if any(() in side or len(set(side)) < len(side) for side in keys):
         keys = [[path.stem for path in side] for side in files]
     left, right = (dict(zip(side_keys, side, strict=True)) for side_keys, side in zip(keys, files, strict=True))
@@ -105,6 +105,14 @@ def pair_by_name(
             )
         logger.warning("%s: %d frames are left out: %s", left_folder.parent, (~whole).sum(), "; ".join(parts))
     return [(left[key], right[key]) for key in frames if key in left and key in right], whole
+
+
+def _frame_keys(files: Sequence[Sequence[Path]]) -> list[list[Key]]:
+    """The numbers in names, without one that is in all left names k and in all right ones k + 1: cam0_07, cam1_07."""
+    keys = [[tuple(map(int, re.findall(r"\d+", path.stem))) for path in side] for side in files]
+    places = zip(*([set(place) for place in zip(*side, strict=False)] for side in keys), strict=False)
+    cameras = {k for k, (left, right) in enumerate(places) if right == {min(left) + 1} and len(left) == 1}
+    return [[tuple(n for k, n in enumerate(key) if k not in cameras) for key in side] for side in keys]
 
 
 def frame_numbers(files: Sequence[tuple[Path, Path]]) -> list[int] | None:
