@@ -322,7 +322,7 @@ class StereoCamera:
     def from_yaml(cls, path: str | os.PathLike[str]) -> Self:
         """Read a calibration file.
 
-        The form (sizes and K in pixels, lengths in metres; further keys at the top are ignored)::
+        The form (sizes and K in pixels, lengths in metres; what `calibrate` writes beside is left alone)::
 
             left: {width: 752, height: 480, fx: 458.654, fy: 457.296, cx: 367.215, cy: 248.375,
                    skew: 0.0,                      # optional, 0
@@ -337,6 +337,7 @@ class StereoCamera:
             CalibrationError: the file cannot be read, a key is missing or wrong; names file, key and value.
         """
         content = CalibrationYaml.read(path)
+        content.reject_unknown(("left", "right", "T_left_right", "sigmas", "covariance", "residuals", "parameters"))
         left, right = (_camera_from_yaml(content.section(eye)) for eye in ("left", "right"))
         T_left_right, sigmas = content.numbers("T_left_right", (4, 4)), CalibrationSigmas.from_yaml(content)
         covariance = CalibrationCovariance.from_yaml(content)

@@ -241,6 +241,7 @@ def change(path, value):
         (["left", "distortion_model"], "brown", "left: distortion_model is 'brown'"),
         (["left", "distortion"], [0.1], "left: distortion has 1 coefficients"),
         (["left", "distorsion"], [0.1], "left: unknown key distorsion; known are width"),
+        (["sigma"], {"focal": 0.1}, "unknown key sigma; known are left, right, T_left_right, sigmas, covariance"),
         (["T_left_right"], None, "key 'T_left_right' is missing; expected 4x4 numbers"),
         (["T_left_right"], [[1, 0, 0], [0, 1, 0], [0, 0, 1]], r"must be 4x4 numbers in lists.*\(size 3x3\)"),
         (["T_left_right"], [[1, 0], [0]], "must be 4x4 numbers in lists"),
@@ -290,7 +291,9 @@ def test_missing_or_binary_yaml_is_refused(tmp_path):
 def test_yaml_optional_keys_and_exponents(tmp_path):
     file = tmp_path / "stereo.yaml"
     content = change(["left", "skew"], 0)
-    file.write_text("%YAML:1.0\n" + yaml.safe_dump(content | {"note": "by hand"}).replace("skew: 0", "skew: 1e-3"))
+    file.write_text(
+        "%YAML:1.0\n" + yaml.safe_dump(content | {"residuals": {"rms": 0.1}}).replace("skew: 0", "skew: 1e-3")
+    )
     camera = StereoCamera.from_yaml(file)
     assert camera.left.skew == 1e-3
     assert camera.right == CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0)
