@@ -34,8 +34,6 @@ _EYES = (
     (("LEFT.K", "RIGHT.K"), ("LEFT.D", "RIGHT.D"), ("LEFT.R", "RIGHT.R"), ("LEFT.P", "RIGHT.P")),
 )
 _SIZES = (("image_width", "image_height"), ("Camera.width", "Camera.height"), ("LEFT.width", "LEFT.height"))
-# OpenCV keeps the unit of the chessboard's squares. A longer baseline, in metres, is taken for millimetres.
-_LONGEST_BASELINE = 3.0
 
 
 def is_file_storage(text: str) -> bool:
@@ -163,15 +161,7 @@ def _from_matrices(
     rotation = _matrix(storage, "R")
     R = cv2.Rodrigues(rotation)[0] if rotation.size == 3 else _matrix(storage, "R", (3, 3))
     T_right_left = rigid_motion(R, _matrix(storage, "T", (3,)))
-    camera = stereo_camera(f"{storage.path}: R and T", models, T_right_left)
-    if camera.baseline > _LONGEST_BASELINE:
-        logger.warning(
-            "%s: a baseline of %.4g m; T has the unit of the chessboard's squares: if they were in millimetres, "
-            "divide T by 1000",
-            storage.path,
-            camera.baseline,
-        )
-    return camera
+    return stereo_camera(f"{storage.path}: R and T", models, T_right_left)
 
 
 def _lens(storage: CalibrationYaml, key: str) -> tuple[str, list[float]]:

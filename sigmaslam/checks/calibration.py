@@ -39,8 +39,8 @@ def _check_baseline(baseline: float) -> Finding:
     ]
     guess = f"is it in {' or '.join(likely)}? Give" if likely else "give"
     message = (
-        f"baseline {baseline:.4g} m is outside {MIN_BASELINE:g} to {MAX_BASELINE:g} m: {guess} T_left_right (or P) "
-        "in metres, as poses have its scale"
+        f"baseline {baseline:.4g} m is outside {MIN_BASELINE:g} to {MAX_BASELINE:g} m: {guess} T_left_right (or P, or "
+        "OpenCV's T, which has the unit of the board's squares) in metres, as poses have its scale"
     )
     return Finding("baseline", "warning", message, baseline)
 

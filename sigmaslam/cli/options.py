@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from sigmaslam.calibration_files.calibration import read_calibration
+from sigmaslam.checks.calibration import check_calibration
+from sigmaslam.checks.finding import wrong
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.inference.session import PROVIDERS
@@ -55,10 +57,12 @@ Size = Annotated[
 
 
 def read_sized(file: Path, size: str | None, rectified: bool = False) -> StereoCamera:
-    """A calibration of any form, with the size in words for those that lack it."""
-    if size is None:
-        return read_calibration(file, rectified=rectified)
-    numbers = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size)
-    if numbers is None:
+    """A calibration of any form, with the size in words for those that lack it; warns of lengths that no rig has."""
+    numbers = re.fullmatch(r"(\d{1,5})x(\d{1,5})", size or "")
+    if size is not None and numbers is None:
         raise InputError(f"--size is {size!r}: give width and height in pixels, as 752x480")
-    return read_calibration(file, (int(numbers[1]), int(numbers[2])), rectified=rectified)
+    image_size = (int(numbers[1]), int(numbers[2])) if numbers is not None else None
+    camera = read_calibration(file, image_size, rectified=rectified)
+    for finding in wrong(check_calibration(camera)):
+        typer.echo(f"warning: {file}: {finding.message}", err=True)
+    return camera

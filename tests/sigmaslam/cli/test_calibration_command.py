@@ -1,6 +1,7 @@
 """`sigmaslam calibration`, and tracking with what it wrote."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,16 @@ def test_show_prints_baseline_models_and_fields_of_view(tmp_path: Path):
     # 2 atan(w / 2f) of the known rig, to the pixel that the centre is off.
     assert f"{2 * np.degrees(np.arctan(336 / 358.6)):.0f}." in result.stdout
     assert "images    rectified" in result.stdout
+
+
+@pytest.mark.parametrize("form", ["own", "Kalibr", "OpenCV", "ROS"])
+def test_show_warns_of_lengths_in_millimetres_in_any_form(tmp_path: Path, form: str):
+    rig = forms.raw_rig("radtan")
+    T = rig.T_left_right.copy()
+    T[:3, 3] *= 1e3
+    result = run_here("calibrate", "show", forms.RAW_FORMS[form](replace(rig, T_left_right=T), tmp_path))
+    assert result.returncode == 0, result.stderr
+    assert "baseline 119.9 m is outside 0.003 to 3 m: is it in millimetres (0.12 m)" in " ".join(result.stderr.split())
 
 
 @pytest.mark.parametrize("form", ["Kalibr", "OpenCV in two files", "ROS", "EuRoC", "ZED"])
