@@ -125,7 +125,7 @@ def _files(path: Path) -> list[Path]:
             looked = ", ".join(" + ".join(names) for names in FOLDER_FILES)
             raise CalibrationError(f"{path}: a folder without a calibration; looked for {looked}")
         return found
-    names = str(path).split(",")
+    names = [name.strip() for name in str(path).split(",")]
     if not path.exists() and len(names) in (2, len(UNDISTORTED)) and all(names):
         return [Path(name) for name in names]
     return [path]

@@ -264,6 +264,13 @@ def test_opencv_with_four_coefficients_is_warned_about(tmp_path: Path, caplog):
     assert "4 coefficients, taken as k1 k2 p1 p2" in caplog.text
 
 
+def test_a_blank_after_the_comma_is_no_part_of_a_name(tmp_path: Path):
+    forms.write_ros(raw_rig("radtan"), tmp_path)
+    pair = f"{tmp_path / 'left.yaml'},{tmp_path / 'right.yaml'}"
+    spaced = read_calibration(pair.replace(",", ", "))
+    np.testing.assert_array_equal(spaced.T_left_right, read_calibration(pair).T_left_right)
+
+
 def test_one_eye_alone_is_refused(tmp_path: Path):
     forms.write_ros(raw_rig("radtan"), tmp_path)
     with pytest.raises(CalibrationError, match=r"of one eye; .* left.yaml,right.yaml"):
