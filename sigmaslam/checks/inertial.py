@@ -19,6 +19,8 @@ _GAP, _LEAST_RATE, _LEAST_ODOMETRY_RATE = 2.5, 50.0, 10.0
 _RATES = np.radians([125, 250, 500, 1000, 2000, 4000])
 _FORCES = STANDARD_GRAVITY * np.array([2, 4, 8, 16, 32])
 _AT_END, _FLAT = 0.02, 3
+# What times in other units were off by when read: large whole ones are read as nanoseconds, others as seconds.
+_UNITS = (("", 1.0), ("micro", 1e-3), ("milli", 1e-6), ("milli", 1e3), ("micro", 1e6), ("nano", 1e9))
 
 
 def check_inertial(recording: InertialRecording, timestamps: Sequence[float] | None) -> Finding:
@@ -63,15 +65,18 @@ def check_times(
     t, source = recording.samples.timestamp, recording.source
     intervals = np.diff(t)
     rate = 1.0 / float(np.median(intervals))
+    unit = next((name for name, factor in _UNITS if 10.0 < factor * rate < 2e3), "")
     if images is not None and len(images):
         shifted = np.asarray(images) + recording.sensor.time_shift
         covered = float(np.mean((shifted >= t[0]) & (shifted <= t[-1])))
         if covered < 1.0:
-            message = f"{source}: {1.0 - covered:.0%} of the images lie outside its time: is it of the same clock?"
+            cure = f"they look like {unit}seconds: give seconds" if unit else "is it of the same clock?"
+            message = f"{source}: {1.0 - covered:.0%} of the images lie outside its times: {cure}"
             return Finding(name, "error" if covered < 0.5 else "warning", message, covered)
     gaps = intervals[intervals > _GAP / rate]
     if rate < least_rate or len(gaps):
-        message = f"{source}: {rate:.0f} samples a second, {len(gaps)} gaps of up to {intervals.max():.2f} s"
+        doubt = f" (are its times {unit}seconds?)" if unit else ""
+        message = f"{source}: {rate:.0f} samples a second{doubt}, {len(gaps)} gaps of up to {intervals.max():.2f} s"
         return Finding(name, "warning", f"{message}: at least {least_rate:.0f} without gaps carry a pose", rate)
     return Finding(name, "ok", f"{rate:.0f} samples a second", rate)
 

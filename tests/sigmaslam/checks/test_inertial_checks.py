@@ -26,6 +26,20 @@ def test_a_good_table_is_ok():
     assert check_inertial(recorded(), None).severity == "ok"
 
 
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e-3, "micro"), (1e-6, "milli"), (1e3, "milli"), (1e6, "micro"), (1e9, "nano")]
+)
+def test_other_units_of_time_are_named(factor: float, unit: str):
+    """Whole milli- and microseconds since 1970 are read as nanoseconds, smaller ones as seconds."""
+    recording = recorded()
+    samples = replace(recording.samples, timestamp=factor * recording.samples.timestamp)
+    found = check_inertial(replace(recording, samples=samples), (IMAGES - 9.0).tolist())
+    assert found.severity == "error"
+    assert f"100% of the images lie outside its times: they look like {unit}seconds: give seconds" in found.message
+    if factor > 1.0:
+        assert f"(are its times {unit}seconds?)" in check_times(replace(recording, samples=samples), None).message
+
+
 def test_saturation_is_said():
     recording = recorded()
     samples = recording.samples
@@ -44,9 +58,9 @@ def test_saturation_is_said():
         (recorded(scale=1 / 9.80665), "error", "it is in g: give m/s"),
         (recorded(scale=1000 / 9.80665), "error", "it is in mg"),
         (recorded(scale=0.3), "error", "are its columns those"),
-        (recorded(shift=100.0), "error", "100% of the images lie outside its time"),
+        (recorded(shift=100.0), "error", "100% of the images lie outside its times: is it of the same clock?"),
         (recorded(shift=-2.0), "warning", "of the images lie outside"),
-        (recorded(every=10), "warning", "20 samples a second"),
+        (recorded(every=10), "warning", "20 samples a second, 0 gaps"),
         (recorded(keep=2.0), "warning", "1 gaps of up to 0.3"),
     ],
 )
