@@ -194,6 +194,7 @@ def check_grey(image: np.ndarray, name: str) -> None:
         )
     if image.ndim != 2 or image.dtype != np.uint8:
         mend = "; colours go by cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)" if image.ndim == 3 else ""
+        mend = "; take image[:, :, 0]" if image.ndim == 3 and image.shape[2] == 1 else mend
         mend += "" if image.dtype == np.uint8 else "; scale the values to 0 to 255 and use image.astype(np.uint8)"
         raise FrameError(f"{name} is {image.dtype} of shape {image.shape}: give a grey (H, W) uint8 image{mend}")
 

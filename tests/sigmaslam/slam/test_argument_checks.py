@@ -33,6 +33,7 @@ def tracker(demo_sequence: Path) -> StereoTracker:
 IMAGE = np.zeros((240, 320), np.uint8)
 WRONG_IMAGES = [
     (np.zeros((240, 320, 3), np.uint8), r"uint8 of shape \(240, 320, 3\).*cv2.COLOR_BGR2GRAY"),
+    (IMAGE[:, :, None], r"uint8 of shape \(240, 320, 1\): give a grey .*; take image\[:, :, 0\]$"),
     (IMAGE.astype(float), r"float64 of shape \(240, 320\).*astype\(np.uint8\)"),
     (IMAGE.astype(np.uint16), r"uint16 of shape \(240, 320\)"),
     (IMAGE > 0, "bool of shape"),
