@@ -65,7 +65,7 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
         Doubt.INPUT: "a check of the input found that the eyes do not fit",
         Doubt.OFFSET: "disparities are off by more than calibrations are. Poses are corrected, and have the scale of a "
         "calibration that is right within arm's reach, where boards are held: calibrate again",
-        Doubt.TIME: "the image shows another moment than its stamp says: does the driver deliver frames out of order?",
+        Doubt.TIME: "the image shows another moment than its stamp says, as if the driver exchanged frames",
         Doubt.MOTIONS: "two motions explain the image about as well: a torn image, or something large that moves",
     }
     # Of these the covariances say nothing, or not all.
@@ -79,10 +79,8 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
         Doubt.EYES: "From {first:.1f} s on, in {frames} frames, the left image is of the right eye: they have no pose. "
         "Does the driver number the cameras anew?",
     }
-    usual = (
-        "From {first:.1f} s on, in {frames} frames: {words}. The covariances of these poses hold what that may make "
-    )
-    usual += "of them."
+    usual = "From {first:.1f} s on, in {frames} frames: {words}. The covariances of these poses are widened by what "
+    usual += "that may make of them."
     return [
         alone.get(reason, usual).format(**found, words=words.get(reason, reason))
         for reason, found in summary.get("doubts", {}).items()
@@ -123,7 +121,7 @@ def calibration_verdict(
     words = _main_verdict(calibration, frames, points, expected, findings)
     if calibration.worse > 1.0:
         words += f" Lenses and turns seem about {calibration.worse:.1f} times as far off as the "
-        words += "calibration's sigmas say: the covariances hold that."
+        words += "calibration's sigmas say: the covariances are widened by that."
     return words
 
 
@@ -186,7 +184,7 @@ def explain_failure(summary: dict[str, Any], in_map: bool, started: bool, findin
         return None
     if frames == skipped:
         return f"None of the {frames} frames could be read." if frames else "There was no frame."
-    reasons = " ".join(explain(findings).splitlines())
+    reasons = "; ".join(explain(findings).splitlines()).replace("?; ", "? ")
     if tracked:
         unsure = f"{ambiguous} are ambiguous, " if ambiguous else ""
         counts = (

@@ -197,6 +197,15 @@ def test_what_a_check_found_explains_a_failure():
     assert "6 are lost" in little
     assert little.endswith("left and right are exchanged: swap them")
     assert explain_failure(summary_of(tracking=8), False, True, findings) is None
+    several = [
+        Finding("exposure", "warning", "images are dark"),
+        Finding("overlap", "error", "few matches: is it the calibration of these images?"),
+        Finding("rows", "error", "rows are off"),
+    ]
+    both = explain_failure(summary_of(starting=8), False, False, several)
+    assert both == (
+        "Nothing was tracked: images are dark; few matches: is it the calibration of these images? rows are off"
+    )
 
 
 def test_poses_are_guesses_where_the_camera_is_lost_or_has_not_moved_yet(tmp_path: Path):
