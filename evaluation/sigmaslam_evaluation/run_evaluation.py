@@ -36,9 +36,9 @@ from sigmaslam_evaluation.truth_conventions import (
     TruthConvention,
     describe_mirror,
     find_convention,
-    find_time_unit,
     find_truth,
-    scale_times,
+    interpolate_truth,
+    times_in_seconds,
 )
 from sigmaslam_evaluation.truth_errors import TruthKind, leave_out_interpolated, truth_errors
 
@@ -63,8 +63,8 @@ def evaluate_run(
 ) -> Evaluation:
     """Compare a run folder or a trajectory file with the truth.
 
-    Frames are paired by time. Where either file is KITTI without times.txt and both have as many poses, or a run has as
-    many frames, they are paired by index; else the 10 Hz of KITTI are assumed and every time must then agree.
+    Frames are paired by time (see `interpolate_truth`). Where either file is KITTI without times.txt and both have as
+    many poses, or a run as many frames, they are paired by index; else 10 Hz are assumed and every time must agree.
     Of a run with `--track-object` the truth is T_camera_object of any frame that is fixed to the body.
     The frames of a run are those of its `frames.csv` that have a truth; for a file alone they are as many as fit into
     the time of the truth at the estimate's rate, and never more than there are true poses. Where the truth would fit in
@@ -89,23 +89,19 @@ def evaluate_run(
     run_or_trajectory, truth = Path(run_or_trajectory), find_truth(Path(truth))
     is_run = run_or_trajectory.is_dir()
     estimate_path = run_or_trajectory / "trajectory.tum" if is_run else run_or_trajectory
-    frames = None
     if is_run:
         check_has_trajectory(run_or_trajectory)
-        if (run_or_trajectory / FRAMES_NAME).is_file():
-            frames = read_frames(run_or_trajectory / FRAMES_NAME)
+    frames = read_frames(run_or_trajectory / FRAMES_NAME) if (run_or_trajectory / FRAMES_NAME).is_file() else None
     estimate, true, association = _same_clock(estimate_path, truth, frames)
-    pairs = _count_pairs(estimate_path, truth, estimate, true, association)
-    unpaired = _describe_unpaired(estimate, true, pairs)
+    unpaired = _describe_unpaired(estimate, true, _count_pairs(estimate_path, truth, estimate, true, association))
     follows_object = is_run and _follows_object(run_or_trajectory)
     convention, has_quaternions = truth_convention or TruthConvention(), trajectory_format(truth) == "tum"
     if convention.quaternion != "xyzw" and not has_quaternions:
         raise InputError(f"{truth}: the order of quaternions can be chosen for TUM files alone, and this is none")
     other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
     true = convention.apply(true)
-    hint = None if other is None else other.describe()
-    if other is None and not follows_object:
-        hint = describe_mirror(estimate, true)
+    hint = other.describe() if other else None if follows_object else describe_mirror(estimate, true)
+    true, interpolated = interpolate_truth(estimate, true)
     kept, left_out = leave_out_interpolated(estimate, true)
     of_truth, guess = truth_errors(truth, kept, truth_kind, (truth_sigma_position, truth_sigma_rotation))
     true, left_out = (true, None) if of_truth is None else (kept, left_out)
@@ -138,7 +134,7 @@ def evaluate_run(
         final=_evaluate_final(run_or_trajectory, estimate, true, of_truth) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
         truth_hint=hint,
-        truth_notes=tuple(note for note in (guess, left_out, unpaired) if note),
+        truth_notes=tuple(note for note in (guess, left_out, unpaired, interpolated) if note),
     )
     if plot and is_run:
         keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, evaluation.nees)
@@ -197,10 +193,7 @@ def _same_clock(estimate_path: Path, truth_path: Path, frames: FrameTable | None
         trajectory_format(path) == "kitti" and kitti_times_path(path) is None for path in (estimate_path, truth_path)
     )
     if not untimed:
-        unit = find_time_unit(estimate, truth)
-        if unit is None:
-            return estimate, truth, "time"
-        return estimate, scale_times(truth, unit), f"time, that of the truth in {unit}"
+        return estimate, *times_in_seconds(estimate, truth)
     if len(estimate) == len(truth):
         return estimate, Trajectory(estimate.timestamps, truth.poses), "index"
     if frames is not None and len(frames) == len(truth):

@@ -1,4 +1,4 @@
-"""Conventions of truth files: applies the one that is said, and finds the one that makes the error collapse."""
+"""Conventions of truth files: frame, unit, clock. Applies those that are said, finds those that fit."""
 
 from dataclasses import dataclass, fields, replace
 from itertools import product
@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from sigmaslam.errors import InputError
-from sigmaslam.geometry.se3 import matrix_to_quaternion, quaternion_to_matrix, se3_inverse
+from sigmaslam.geometry.se3 import matrix_to_quaternion, quaternion_to_matrix, rotation_exp, rotation_log, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam_evaluation.metrics.trajectory_errors import MAX_DIFFERENCE, absolute_trajectory_error, associate
+from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error, associate
 
 # Another convention is the right one where it leaves less than this share of the error.
 COLLAPSE = 0.1
@@ -19,6 +19,9 @@ _ALIKE = 2.0
 # The axes of a camera (x right, y down, z ahead) in a body with x ahead, y left and z up.
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 TIME_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+# Seconds between stamps of one moment, and between poses to interpolate: of 10 Hz with jitter, over which a line misses
+# less than the nearest pose does, unless the speed changes by as much as itself.
+_SAME, _WIDEST = 1e-6, 0.15
 # Names that truths have in recordings' folders.
 _TRUTHS = (
     "groundtruth.tum",
@@ -145,24 +148,50 @@ def describe_mirror(estimate: Trajectory, truth: Trajectory) -> str | None:
     return None
 
 
-def find_time_unit(estimate: Trajectory, truth: Trajectory) -> str | None:
-    """The unit of the truth's times, one of `TIME_UNITS`; None for seconds.
+def interpolate_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, str | None]:
+    """The truth with poses moved to the stamps of the estimate's that they pair with, and a word.
 
-    More poses must pair with it than with seconds, and more than half of all.
+    A pose moves on the line between its neighbours, 0.15 s apart at most, and turns about one axis (slerp); covariances
+    hold on, as a mean's are no larger. Ends of a truth that is interpolated are cut to poses with two neighbours.
     """
-    counts = {unit: _count_pairs(estimate, scale_times(truth, unit)) for unit in TIME_UNITS}
+    rows, paired = associate(estimate, truth)
+    times, stamps, poses = estimate.timestamps[rows], truth.timestamps.copy(), truth.poses.copy()
+    distance, after = np.abs(times - stamps[paired]), np.searchsorted(stamps, times)
+    width = np.diff(stamps, prepend=-np.inf, append=np.inf)[after]
+    moved, alone = (distance > _SAME) & (width < _WIDEST), (distance > _SAME) & np.isinf(width)
+    if not moved.any():
+        return truth, None
+    first, second = truth.rotations[after[moved] - 1], truth.rotations[after[moved]]
+    turns = ((times - stamps[after - 1]) / width)[moved, None] * rotation_log(np.swapaxes(first, 1, 2) @ second)
+    stamps[paired[moved]], poses[paired[moved]] = times[moved], _poses_at(truth, times[moved])
+    poses[paired[moved], :3, :3] = first @ rotation_exp(turns)
+    kept = slice(paired[1] if alone[0] else 0, paired[-2] + 1 if alone[-1] else None)
+    median = f"{1e3 * np.median(distance[moved]):.2g} ms from its nearest in the median"
+    return Trajectory(stamps[kept], poses[kept]), f"is interpolated at {moved.sum()} poses, {median}"
+
+
+def times_in_seconds(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, str]:
+    """The truth in seconds, and "time", with the unit its times have where it is one of `TIME_UNITS`.
+
+    More poses must pair with that than with seconds, and more than half of all.
+    """
+    scaled = {unit: Trajectory(truth.timestamps * size, truth.poses) for unit, size in TIME_UNITS.items()}
+    counts = {unit: _count_pairs(estimate, each) for unit, each in scaled.items()}
     best = max(counts, key=lambda unit: counts[unit])
-    enough = max(_count_pairs(estimate, truth), min(len(estimate), len(truth)) // 2)
-    return best if counts[best] > enough else None
+    if counts[best] <= max(_count_pairs(estimate, truth), min(len(estimate), len(truth)) // 2):
+        return truth, "time"
+    return scaled[best], f"time, that of the truth in {best}"
 
 
-def scale_times(truth: Trajectory, unit: str) -> Trajectory:
-    """The truth with its times, which are in `unit`, as seconds."""
-    return Trajectory(truth.timestamps * TIME_UNITS[unit], truth.poses)
+def _poses_at(truth: Trajectory, times: np.ndarray) -> np.ndarray:
+    """(N, 4, 4) on the lines between the poses before and after, their rotations too."""
+    after = np.clip(np.searchsorted(truth.timestamps, times), 1, len(truth) - 1)
+    share = (times - truth.timestamps[after - 1]) / (truth.timestamps[after] - truth.timestamps[after - 1])
+    return truth.poses[after - 1] + share[:, None, None] * (truth.poses[after] - truth.poses[after - 1])
 
 
 def _count_pairs(estimate: Trajectory, truth: Trajectory) -> int:
     try:
-        return len(associate(estimate, truth, MAX_DIFFERENCE)[0])
+        return len(associate(estimate, truth)[0])
     except InputError:
         return 0

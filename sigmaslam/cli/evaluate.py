@@ -44,7 +44,7 @@ def evaluate(
     where it is no better than the estimate. What you do not say is guessed and printed.
 
     Where the truth would fit in another frame, order or unit, a line says so with the option that applies it; seconds,
-    milli-, micro- and nanoseconds are found out.
+    milli-, micro- and nanoseconds are found out. Between its poses the truth is interpolated.
 
     Of a run with --track-object the truth is T_camera_object of any frame that is fixed to the body.
     """

@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from sigmaslam.errors import InputError
-from sigmaslam.geometry.se3 import matrix_to_quaternion, se3_exp, se3_inverse
+from sigmaslam.geometry.se3 import matrix_to_quaternion, rotation_exp, se3_exp, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, write_kitti, write_tum
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
+from sigmaslam_evaluation.metrics.trajectory_errors import associate
 from sigmaslam_evaluation.run_evaluation import evaluate_run
-from sigmaslam_evaluation.truth_conventions import TIME_UNITS, TruthConvention, find_truth
+from sigmaslam_evaluation.truth_conventions import TIME_UNITS, TruthConvention, find_truth, interpolate_truth
 from tests.support.commands import assert_refused, run_here
 
 KITTI = ("04", "05", "07", "10")
@@ -219,3 +222,66 @@ def test_the_truth_of_a_folder_is_found_by_its_usual_names(tmp_path):
     assert find_truth(tmp_path) == find_truth(euroc) == euroc
     # What a file is not is said where it is read.
     assert find_truth(tmp_path / "nowhere.txt") == tmp_path / "nowhere.txt"
+
+
+@pytest.fixture
+def flight(real_data: Path, tmp_path: Path) -> tuple[Trajectory, Trajectory]:
+    """The real truth of a hand-held flight at 20 Hz, five seconds long, and an estimate that drifts."""
+    truth = read_trajectory(real_data / "euroc_mh01_f000_099" / "groundtruth.tum")
+    write_estimate(tmp_path / "estimate.tum", truth)
+    return truth, read_trajectory(tmp_path / "estimate.tum")
+
+
+def spin(times: np.ndarray, rate: float = 3.0) -> Trajectory:
+    """A body that moves along a line at 2 m/s and turns about a fixed axis, radians a second."""
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, 3] = times[:, None] * np.array([1.2, -1.6, 0.0])
+    poses[:, :3, :3] = rotation_exp(times[:, None] * rate * np.array([0.48, 0.6, 0.64]))
+    return Trajectory(times, poses)
+
+
+@pytest.mark.parametrize(("rate", "begin", "shift"), [(30.0, 0.0, 17), (10.0, 0.004, 4), (200.0, -0.001, 1)])
+def test_a_truth_of_another_rate_is_interpolated(rate: float, begin: float, shift: int):
+    """A steady motion is met exactly, whatever it turns between two poses."""
+    estimate, truth = spin(0.05 * np.arange(1, 60)), spin(begin + np.arange(round(3 * rate) + 2) / rate)
+    moved, word = interpolate_truth(estimate, truth)
+    rows, there = associate(estimate, moved, 1e-6)
+    assert len(rows) == len(associate(estimate, truth)[0]) > len(estimate) / 3
+    np.testing.assert_allclose(moved.positions[there], estimate.positions[rows], atol=4e-6)  # of 1 us and 2 m/s
+    np.testing.assert_allclose(moved.rotations[there], estimate.rotations[rows], atol=6e-6)  # and 3 radians a second
+    assert len(moved) == len(truth)
+    assert (np.diff(moved.timestamps) > 0).all()
+    assert word is not None
+    assert f"poses, {shift} ms from its nearest" in word
+
+
+def test_what_meets_to_a_microsecond_or_has_no_near_neighbours_stays_to_the_bit():
+    estimate = spin(0.05 * np.arange(60))
+    for times in (estimate.timestamps, estimate.timestamps[::2] + 9e-7, 0.005 + 0.2 * np.arange(10)):
+        truth = spin(times)
+        assert interpolate_truth(estimate, truth) == (truth, None)
+    gap = spin(np.delete(0.005 + 0.05 * np.arange(60), [20, 21, 22]))  # 0.2 s from pose to pose
+    moved, _ = interpolate_truth(estimate, gap)
+    changed = moved.timestamps != gap.timestamps[1:]
+    assert np.flatnonzero(~changed).tolist() == [19]
+    assert len(moved) == len(gap) - 1  # the first has no pose before the frame
+
+
+def test_a_truth_at_30_hz_gives_the_figures_of_the_frames_own(flight, tmp_path: Path):
+    """A spline through the flight's poses is seen at 30 Hz."""
+    truth, _ = flight
+    since = truth.timestamps - truth.timestamps[0]
+    times = np.arange(0.003, since[-1], 1 / 30)
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, 3] = CubicSpline(since, truth.positions)(times)
+    poses[:, :3, :3] = RotationSpline(since, Rotation.from_matrix(truth.rotations))(times).as_matrix()
+    write_tum(tmp_path / "own.tum", truth)
+    write_tum(tmp_path / "truth.tum", Trajectory(truth.timestamps[0] + times, poses))
+    own, seen = (
+        evaluate_run(tmp_path / "estimate.tum", tmp_path / name, plot=False) for name in ("own.tum", "truth.tum")
+    )
+    assert "interpolated" not in format_evaluation(own)
+    assert "The truth is interpolated at 98 poses, 8.3 ms from its nearest" in format_evaluation(seen)
+    assert seen.rpe.translation_rmse < 5e-4  # of the nearest poses 5e-3
+    assert seen.rpe.rotation_rmse_deg < 0.05
+    assert seen.ate.rmse == pytest.approx(own.ate.rmse, rel=0.05)

@@ -303,9 +303,8 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
     """
     estimate_index, truth_index = associate(estimate, truth)
     estimated, true = estimate.poses[estimate_index], truth.poses[truth_index]
-    first = np.zeros(1, dtype=np.int64)
-    every = np.arange(len(estimated))
-    errors = se3_log(se3_inverse(_motions(estimated, first, every)) @ _motions(true, first, every))
+    since_first, true = (se3_inverse(each[:1]) @ each for each in (estimated, true))
+    errors = se3_log(se3_inverse(since_first) @ true)
     return PoseErrors(estimate.timestamps[estimate_index], errors, estimate_index)
 
 
