@@ -1,6 +1,6 @@
 """Conventions of truth files: frame, unit, clock. Applies those that are said, finds those that fit."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -10,7 +10,7 @@ import numpy as np
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import matrix_to_quaternion, quaternion_to_matrix, rotation_exp, rotation_log, se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
-from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error, associate
+from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error, associate, synchronise
 
 # Another convention is the right one where it leaves less than this share of the error.
 COLLAPSE = 0.1
@@ -19,6 +19,7 @@ _ALIKE = 2.0
 # The axes of a camera (x right, y down, z ahead) in a body with x ahead, y left and z up.
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 TIME_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 # Seconds between stamps of one moment, and between poses to interpolate: of 10 Hz with jitter, over which a line misses
 # less than the nearest pose does, unless the speed changes by as much as itself.
 _SAME, _WIDEST = 1e-6, 0.15
@@ -59,22 +60,15 @@ class TruthConvention:
     frame: Literal["camera", "body"] = "camera"
     inverse: bool = False
     quaternion: Literal["xyzw", "wxyz"] = "xyzw"
-    unit: Literal["m", "mm"] = "m"
-
-    @property
-    def changes(self) -> int:
-        """In how many things it differs from the defaults."""
-        return sum(getattr(self, field.name) != field.default for field in fields(self))
+    unit: Literal["m", "cm", "mm"] = "m"
 
     def apply(self, truth: Trajectory) -> Trajectory:
         """T_world_camera in metres, of a file that was read with the defaults."""
         poses = truth.poses.copy()
-        if self.unit == "mm":
-            poses[:, :3, 3] *= 1e-3
+        poses[:, :3, 3] *= UNITS[self.unit]
         if self.quaternion == "wxyz":
             poses[:, :3, :3] = quaternion_to_matrix(np.roll(matrix_to_quaternion(poses[:, :3, :3]), -1, axis=-1))
-        if self.inverse:
-            poses = se3_inverse(poses)
+        poses = se3_inverse(poses) if self.inverse else poses
         if self.frame == "body":
             poses[:, :3, :3] = poses[:, :3, :3] @ R_BODY_CAMERA
         return Trajectory(truth.timestamps, poses)
@@ -85,7 +79,7 @@ class TruthConvention:
             (self.frame == "body", "poses of a body with x ahead", "--truth-frame body"),
             (self.inverse, f"T_{self.frame}_world", "--truth-inverse"),
             (self.quaternion == "wxyz", "quaternions with w first", "--truth-quaternion wxyz"),
-            (self.unit == "mm", "millimetres", "--truth-unit mm"),
+            (self.unit != "m", f"{'centi' if self.unit == 'cm' else 'milli'}metres", f"--truth-unit {self.unit}"),
         ]
         chosen = [(name, option) for wanted, name, option in words if wanted]
         if not chosen:
@@ -99,7 +93,7 @@ def find_convention(
     """The convention that makes the error collapse.
 
     Errors are of poses relative to the first, so every convention but the right one turns or bends the path. The
-    position error must be less than a tenth of the given one's, and the rotation error no larger.
+    position error must be below a tenth of the given one's, the rotation error no larger, a unit right to a factor 2.
 
     Args:
         estimate: N poses.
@@ -109,16 +103,18 @@ def find_convention(
     Returns:
         None where no other makes the error collapse.
     """
+    estimate, truth = synchronise(estimate, truth)
     now = absolute_trajectory_error(estimate, given.apply(truth), "origin")
-    orders = ("xyzw", "wxyz") if has_quaternions else ("xyzw",)
-    found: list[tuple[float, TruthConvention]] = []
-    for frame, inverse, quaternion, unit in product(("camera", "body"), (False, True), orders, ("m", "mm")):
-        candidate = replace(given, frame=frame, inverse=inverse, quaternion=quaternion, unit=unit)  # type: ignore[arg-type]
-        error = absolute_trajectory_error(estimate, candidate.apply(truth), "origin")
-        if error.rmse < COLLAPSE * now.rmse and error.rotation_rmse_deg <= now.rotation_rmse_deg:
-            found.append((error.rmse, candidate))
-    least = min((rmse for rmse, _ in found), default=0.0)
-    alike = [(candidate.changes, rmse, candidate) for rmse, candidate in found if rmse <= _ALIKE * least]
+    usual, found = astuple(TruthConvention()), []
+    for choice in product(("camera", "body"), (False, True), ("xyzw", "wxyz")[: 1 + has_quaternions], UNITS):
+        candidate = TruthConvention(*choice)  # type: ignore[arg-type]
+        error = absolute_trajectory_error(estimate, read := candidate.apply(truth), "origin")
+        fits = candidate.unit == given.unit or 0.5 * estimate.path_length < read.path_length < 2 * estimate.path_length
+        if fits and error.rmse < COLLAPSE * now.rmse and error.rotation_rmse_deg <= now.rotation_rmse_deg:
+            changes = sum(value != default for value, default in zip(choice, usual, strict=True))
+            found.append((changes, error.rmse, candidate))
+    least = min((rmse for _, rmse, _ in found), default=0.0)
+    alike = [each for each in found if each[1] <= _ALIKE * least]
     return min(alike, key=lambda each: each[:2])[2] if alike else None
 
 
@@ -133,18 +129,15 @@ def describe_mirror(estimate: Trajectory, truth: Trajectory) -> str | None:
     """
     now = absolute_trajectory_error(estimate, truth, "origin")
     for axis, name in enumerate("xyz"):
-        mirror = np.ones(3)
-        mirror[axis] = -1.0
+        mirror = 1.0 - 2.0 * np.eye(3)[axis]
         for both in (True, False):
             poses = truth.poses.copy()
             poses[:, :3, 3] *= mirror
-            if both:
-                poses[:, :3, :3] *= mirror[:, None] * mirror
+            poses[:, :3, :3] *= mirror[:, None] * mirror if both else 1.0
             error = absolute_trajectory_error(estimate, Trajectory(truth.timestamps, poses), "origin")
             if error.rmse < COLLAPSE * now.rmse and error.rotation_rmse_deg <= now.rotation_rmse_deg:
-                return (
-                    f"a mirror image: change the sign of {name} in the file{', also of its rotations' if both else ''}"
-                )
+                also = ", also of its rotations" if both else ""
+                return f"a mirror image: change the sign of {name} in the file{also}"
     return None
 
 

@@ -32,7 +32,7 @@ def evaluate(
     truth_quaternion: Annotated[
         Literal["xyzw", "wxyz"], typer.Option(help="Order of a TUM truth's quaternions.")
     ] = "xyzw",
-    truth_unit: Annotated[Literal["m", "mm"], typer.Option(help="Of the true positions.")] = "m",
+    truth_unit: Annotated[Literal["m", "cm", "mm"], typer.Option(help="Of the true positions.")] = "m",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, KITTI t_rel and r_rel, NEES; draws evaluation.png.

@@ -54,8 +54,7 @@ def write_truth(path: Path, truth: Trajectory, convention: TruthConvention, seco
         poses[:, :3, :3] = poses[:, :3, :3] @ axes
     if convention.inverse:
         poses = np.linalg.inv(poses)
-    if convention.unit == "mm":
-        poses[:, :3, 3] *= 1000
+    poses[:, :3, 3] *= {"m": 1, "cm": 100, "mm": 1000}[convention.unit]
     x, y, z, w = matrix_to_quaternion(poses[:, :3, :3]).T
     columns = (w, x, y, z) if convention.quaternion == "wxyz" else (x, y, z, w)
     np.savetxt(path, np.column_stack([truth.timestamps / seconds, poses[:, :3, 3], *columns]), fmt="%.9f")
@@ -65,6 +64,7 @@ CONVENTIONS = [
     TruthConvention(*values)
     for values in itertools.product(("camera", "body"), (False, True), ("xyzw", "wxyz"), ("m", "mm"))
 ]
+CONVENTIONS += [TruthConvention(unit="cm"), TruthConvention("body", True, "wxyz", "cm")]
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS[1:], ids=TruthConvention.describe)
@@ -95,6 +95,15 @@ def test_options_that_a_usual_truth_does_not_need_are_named(
     wrong = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False, truth_convention=convention)
     assert wrong.truth_hint == TruthConvention().describe()
     assert "give no option" in wrong.truth_hint
+
+
+@pytest.mark.parametrize("scale", [3.28, 30.0], ids=["feet", "no unit"])
+def test_no_unit_is_named_that_leaves_the_path_too_long_or_short(demo_sequence: Path, tmp_path: Path, scale: float):
+    truth = read_kitti(demo_sequence / "poses.txt")
+    write_estimate(tmp_path / "estimate.tum", truth)
+    truth.poses[:, :3, 3] *= scale
+    write_tum(tmp_path / "truth.tum", truth)
+    assert evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False).truth_hint is None
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
