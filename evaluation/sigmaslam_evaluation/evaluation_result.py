@@ -9,7 +9,6 @@ import numpy as np
 
 from sigmaslam_evaluation.metrics.relative_consistency import SpanConsistency
 from sigmaslam_evaluation.metrics.trajectory_errors import AbsoluteError, KittiErrors, PoseNees, RelativeError, coverage
-from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.relative_summary import span_to_dict
 
 
@@ -44,7 +43,8 @@ class Evaluation:
         final: of the trajectory after the fact; None where there is none.
         truth_hint: the convention in which the truth would fit, in words and as options; None where it fits as it was
             read, or in no way.
-        truth_notes: what is said of its errors: the kind that is guessed, and poses that are left out.
+        truth_notes: what is said of it: the kind that is guessed, poses that are left out, stamps that differ.
+        nees_verdict: of `judge_nees`; None also where the truth is misread, another run, or lacks rotations.
     """
 
     estimate_path: Path
@@ -65,6 +65,7 @@ class Evaluation:
     predicted: int = 0
     truth_hint: str | None = None
     truth_notes: tuple[str, ...] = ()
+    nees_verdict: dict[str, str] | None = None
 
     @property
     def coverage(self) -> float:
@@ -79,7 +80,7 @@ class Evaluation:
             "association": self.association,
             "truth_hint": self.truth_hint,
             "truth_notes": list(self.truth_notes),
-            "nees_verdict": judge_nees(self.nees, self.relative),
+            "nees_verdict": self.nees_verdict,
             "matched": self.matched,
             "frames": self.frames,
             "coverage": self.coverage,

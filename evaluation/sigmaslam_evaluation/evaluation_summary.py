@@ -2,7 +2,6 @@
 
 from sigmaslam_evaluation.evaluation_result import Evaluation, FinalErrors
 from sigmaslam_evaluation.metrics.trajectory_errors import PoseNees, coverage
-from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.relative_summary import format_relative
 
 # Paths of endoscopes and of cameras at rest are told in millimetres, as metres of four digits would hide their errors.
@@ -39,8 +38,7 @@ def format_evaluation(evaluation: Evaluation) -> str:
     if e.final is not None:
         lines += ["", "After the fact, with loops and smoothing (trajectory_final.tum):", *_error_rows(e.final, size)]
         lines.append(_nees_line(e.final.nees))
-    verdict = judge_nees(e.nees, e.relative)
-    words = ["", verdict["text"]] if verdict else []
+    words = ["", e.nees_verdict["text"]] if e.nees_verdict else []
     return "\n".join([*lines, "", *format_relative(e.relative), *words]) + "\n"
 
 

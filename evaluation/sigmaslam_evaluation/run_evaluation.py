@@ -32,8 +32,10 @@ from sigmaslam_evaluation.metrics.trajectory_errors import (
     synchronise,
 )
 from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors
+from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.truth_conventions import (
     TruthConvention,
+    describe_lack_of_rotation,
     describe_mirror,
     find_convention,
     find_truth,
@@ -101,6 +103,9 @@ def evaluate_run(
     other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
     true = convention.apply(true)
     hint = other.describe() if other else None if follows_object else describe_mirror(estimate, true)
+    doubts = [describe_lack_of_rotation(estimate, true)]
+    if truth.name.startswith("trajectory") and (truth.parent / "run.json").is_file():
+        doubts.append("is another run: of the same images both share errors, and NEES is too small")
     true, interpolated = interpolate_truth(estimate, true)
     kept, left_out = leave_out_interpolated(estimate, true)
     of_truth, guess = truth_errors(truth, kept, truth_kind, (truth_sigma_position, truth_sigma_rotation))
@@ -114,6 +119,7 @@ def evaluate_run(
         of_truth = None if of_truth is None else of_truth.turned(se3_inverse(T_body_followed))
     path = run_or_trajectory / "covariance.npy"  # of a run alone
     covariance = read_covariances(path, len(estimate)) if path.is_file() else None
+    nees = pose_nees(estimate, true, covariance, of_truth) if covariance is not None else None
     matched_estimate, matched_truth = synchronise(estimate, true)
     predicted = np.zeros(len(estimate), bool) if frames is None else predicted_poses(frames, estimate.timestamps)
     evaluation = Evaluation(
@@ -128,16 +134,17 @@ def evaluate_run(
         ate_origin=absolute_trajectory_error(estimate, true, "origin"),
         rpe=relative_pose_error(estimate, true),
         kitti=kitti_errors(estimate, true, lengths, step),
-        nees=pose_nees(estimate, true, covariance, of_truth) if covariance is not None else None,
+        nees=nees,
         relative=relative,
         figure_path=estimate_path.parent / "evaluation.png" if plot and has_matplotlib() else None,
         final=_evaluate_final(run_or_trajectory, estimate, true, of_truth) if is_run else None,
         predicted=int(predicted[associate(estimate, true)[0]].sum()),
         truth_hint=hint,
-        truth_notes=tuple(note for note in (guess, left_out, unpaired, interpolated) if note),
+        truth_notes=tuple(note for note in (guess, left_out, unpaired, interpolated, *doubts) if note),
+        nees_verdict=None if hint or any(doubts) else judge_nees(nees, relative),
     )
     if plot and is_run:
-        keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, evaluation.nees)
+        keep_evaluation(run_or_trajectory, evaluation.to_dict(), estimate, true, nees)
     if evaluation.figure_path:
         figure = draw_evaluation(evaluation, estimate, true, covariance, predicted)
         try:

@@ -141,6 +141,14 @@ def describe_mirror(estimate: Trajectory, truth: Trajectory) -> str | None:
     return None
 
 
+def describe_lack_of_rotation(estimate: Trajectory, truth: Trajectory) -> str | None:
+    """In words, that only the estimate turns; None where both do, or the estimate by less than 5 degrees."""
+    turns = (np.degrees(rotation_log(each.rotations[0].T @ each.rotations)) for each in synchronise(estimate, truth))
+    turned, true = (np.linalg.norm(each, axis=1).max() for each in turns)
+    words = f"never turns, the run by {turned:.0f} deg: of positions alone only ATE in the best alignment counts"
+    return words if turned > 5.0 and true < 1e-3 else None
+
+
 def interpolate_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, str | None]:
     """The truth with poses moved to the stamps of the estimate's that they pair with, and a word.
 

@@ -105,6 +105,24 @@ def test_a_trajectory_after_the_fact_is_evaluated_beside(drive):
     assert "0.0000" in table.partition("After the fact")[2]
 
 
+def test_another_run_as_the_truth_judges_no_sigma(drive, tmp_path: Path):
+    run, truth = drive
+    (tmp_path / "again").mkdir()
+    make_run(tmp_path / "again", read_trajectory(truth))
+    np.save(tmp_path / "again" / "covariance.npy", 100 * np.load(run / "covariance.npy"))
+    write_tum(run / "trajectory.tum", read_trajectory(truth))
+    before = evaluate_run(tmp_path / "again", run / "trajectory.tum", plot=False)
+    assert before.nees_verdict is not None
+    assert "sigma is too large" in before.nees_verdict["text"]
+    (run / "run.json").write_text("{}")
+    after = evaluate_run(tmp_path / "again", run / "trajectory.tum", plot=False)
+    assert after.nees_verdict is None
+    assert "The truth is another run: of the same images both share errors" in format_evaluation(after)
+    assert "too large" not in format_evaluation(after)
+    (run / "trajectory.tum").rename(run / "groundtruth.tum")  # a truth that someone put beside the run
+    assert evaluate_run(tmp_path / "again", run / "groundtruth.tum", plot=False).nees_verdict == before.nees_verdict
+
+
 def test_a_trajectory_after_the_fact_of_another_run_is_refused(drive):
     run, truth = drive
     write_tum(run / "trajectory_final.tum", read_trajectory(run / "trajectory.tum").subset(np.arange(20)))

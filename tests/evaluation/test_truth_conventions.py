@@ -16,7 +16,13 @@ from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, writ
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
 from sigmaslam_evaluation.metrics.trajectory_errors import associate
 from sigmaslam_evaluation.run_evaluation import evaluate_run
-from sigmaslam_evaluation.truth_conventions import TIME_UNITS, TruthConvention, find_truth, interpolate_truth
+from sigmaslam_evaluation.truth_conventions import (
+    TIME_UNITS,
+    TruthConvention,
+    describe_lack_of_rotation,
+    find_truth,
+    interpolate_truth,
+)
 from tests.support.commands import assert_refused, run_here
 
 KITTI = ("04", "05", "07", "10")
@@ -294,3 +300,15 @@ def test_a_truth_at_30_hz_gives_the_figures_of_the_frames_own(flight, tmp_path: 
     assert seen.rpe.translation_rmse < 5e-4  # of the nearest poses 5e-3
     assert seen.rpe.rotation_rmse_deg < 0.05
     assert seen.ate.rmse == pytest.approx(own.ate.rmse, rel=0.05)
+
+
+def test_a_truth_of_positions_alone_is_named(flight, tmp_path: Path):
+    truth, estimate = flight
+    poses = truth.poses.copy()
+    poses[:, :3, :3] = np.eye(3)
+    write_tum(tmp_path / "truth.tum", Trajectory(truth.timestamps, poses))
+    evaluation = evaluate_run(tmp_path / "estimate.tum", tmp_path / "truth.tum", plot=False)
+    assert "The truth never turns, the run by 24 deg: of positions alone" in format_evaluation(evaluation)
+    assert evaluation.nees_verdict is None
+    assert describe_lack_of_rotation(estimate, truth) is None
+    assert describe_lack_of_rotation(Trajectory(truth.timestamps, poses), truth) is None
