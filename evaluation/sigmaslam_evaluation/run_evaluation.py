@@ -35,6 +35,7 @@ from sigmaslam_evaluation.metrics.truth_covariance import TruthErrors
 from sigmaslam_evaluation.nees_verdict import judge_nees
 from sigmaslam_evaluation.truth_conventions import (
     TruthConvention,
+    describe_clock_offset,
     describe_lack_of_rotation,
     describe_mirror,
     find_convention,
@@ -103,7 +104,7 @@ def evaluate_run(
     other = None if follows_object else find_convention(estimate, true, convention, has_quaternions)
     true = convention.apply(true)
     hint = other.describe() if other else None if follows_object else describe_mirror(estimate, true)
-    doubts = [describe_lack_of_rotation(estimate, true)]
+    doubts = [describe_lack_of_rotation(estimate, true), describe_clock_offset(estimate, true)]
     if truth.name.startswith("trajectory") and (truth.parent / "run.json").is_file():
         doubts.append("is another run: of the same images both share errors, and NEES is too small")
     true, interpolated = interpolate_truth(estimate, true)

@@ -19,6 +19,7 @@ from sigmaslam_evaluation.run_evaluation import evaluate_run
 from sigmaslam_evaluation.truth_conventions import (
     TIME_UNITS,
     TruthConvention,
+    describe_clock_offset,
     describe_lack_of_rotation,
     find_truth,
     interpolate_truth,
@@ -312,3 +313,23 @@ def test_a_truth_of_positions_alone_is_named(flight, tmp_path: Path):
     assert evaluation.nees_verdict is None
     assert describe_lack_of_rotation(estimate, truth) is None
     assert describe_lack_of_rotation(Trajectory(truth.timestamps, poses), truth) is None
+
+
+@pytest.mark.parametrize("offset", [-0.3, 0.1, 0.03])
+def test_a_clock_that_is_off_is_told(flight, offset: float):
+    truth, estimate = flight
+    word = (
+        f"has stamps that look about {1e3 * abs(offset):.0f} ms {'later' if offset > 0 else 'earlier'} than the run's"
+    )
+    assert describe_clock_offset(estimate, Trajectory(truth.timestamps + offset, truth.poses)) == word
+    turned = se3_exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6])) @ truth.poses @ se3_exp(np.array([0, 0, 0, 1.0, 0, 0]))
+    assert describe_clock_offset(estimate, Trajectory(truth.timestamps + offset, turned)) == word
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.1])
+def test_no_clock_is_blamed_for_noise_or_a_steady_motion(flight, noise: float):
+    truth, estimate = flight
+    errors = se3_exp(noise * np.random.default_rng(5).normal(size=(len(truth), 6)))
+    assert describe_clock_offset(estimate, Trajectory(truth.timestamps, truth.poses @ errors)) is None
+    steady = spin(0.05 * np.arange(200))
+    assert describe_clock_offset(steady, Trajectory(steady.timestamps + 0.1, steady.poses)) is None
