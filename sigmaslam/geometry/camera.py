@@ -320,7 +320,7 @@ class StereoCamera:
 
     @classmethod
     def from_yaml(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a calibration file.
+        """Read a calibration file of our own form; `sigmaslam.readers.read_calibration` takes others, too.
 
         The form (sizes and K in pixels, lengths in metres; what `calibrate` writes beside is left alone)::
 
