@@ -87,4 +87,4 @@ def _check_focal(eye: str, model: CameraModel) -> Finding:
             "millimetres or shares of the width"
         )
         return Finding("focal length", "warning", message, view)
-    return Finding("focal length", "ok", f"{shown} are a field of view of {view:.0f} degrees", view)
+    return Finding("focal length", "ok", f"{shown} are a field of view of {view:.0f} degrees without distortion", view)
