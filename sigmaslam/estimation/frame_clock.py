@@ -62,12 +62,16 @@ class FrameClock:
     A Kalman filter of the frame's time: it moves on by the mean interval, with the variance that intervals have beside
     the noise of stamps, by which a stamp is measured. Stamps that can be believed are taken to the bit.
 
+    Args:
+        has_sensor: one of motion predicts, and not the velocity alone.
+
     Attributes:
         late: seconds by which the last interval is longer than usual, if the clock may have been set in it, or 0.
         was_blind: the frame before showed nothing; to be set by who sees it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, has_sensor: bool = False) -> None:
+        self._longest = np.inf if has_sensor else _LONGEST
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
         self._is_believed, self._seconds, self.late, self.was_blind = True, 0.0, 0.0, False
 
@@ -99,7 +103,7 @@ class FrameClock:
             The time between the two frames, its standard deviation, seconds, and by what velocities are too large that
             were learned by a wrong interval, or 1.
         """
-        before, interval = [*self._intervals], min(interval, _LONGEST)
+        before, interval = [*self._intervals], min(interval, self._longest)
         self._intervals.append(interval)
         seconds, sigma = self._estimate(np.array(self._intervals))
         # Of bursts the longest interval is the usual one: they end in such, one like the other.

@@ -96,12 +96,15 @@ class Recovery:
             twist = se3_log(se3_inverse(before) @ found.pose) / (timestamp - since)
             way = delay * (twist - self.motion.twist)  # the view is corrected by that already
             found = replace(found, view=at_one_moment(found.view, self.window.camera, way))
+        while self.keyframes.active:
+            self.keyframes.marginalise_oldest(spare=found.keyframe)
         if dead_reckoning(self.motion) is not None:
             self.course.track(timestamp)
         else:
             self.course.resume(timestamp)
         covariance = turn_covariance(found.pose, found.covariance)
-        new = NewKeyframe(found.view, timestamp, found.pose, found.pose, covariance, origin=found.origin)
+        origin = self.keyframes.index(found.keyframe.origin)
+        new = NewKeyframe(found.view, timestamp, found.pose, found.pose, covariance, origin=origin)
         return self._insert(new, twist)
 
     def go_on_after_bump(self, change: RigChange, view: StereoView, timestamp: float) -> KeyframeTracks | None:

@@ -8,7 +8,7 @@ from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
 from sigmaslam.geometry.se3 import nearest_rigid
-from sigmaslam.slam.keyframe import from_origin
+from sigmaslam.slam.keyframe import KnownKeyframe, from_origin
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import LandmarkAdmission
 from sigmaslam.slam.localisation import Prediction
@@ -21,19 +21,19 @@ _RETRIEVED = 3
 
 @dataclass(frozen=True, slots=True)
 class Relocalisation:
-    """Where a view was found; the window is empty.
+    """Where a view was found.
 
     Attributes:
         view: with disparities where landmarks may be.
         pose: (4, 4) T_world_camera.
-        covariance: (6, 6) of the pose relative to the past pose `origin`, perturbed from the right.
-        origin: index of that past pose.
+        covariance: (6, 6) of the pose relative to that of the keyframe's origin, perturbed from the right.
+        keyframe: that it was found by.
     """
 
     view: StereoView
     pose: np.ndarray
     covariance: np.ndarray
-    origin: int
+    keyframe: KnownKeyframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Relocaliser:
     """Finds views in the last keyframe and among remembered ones.
 
     Attributes:
-        window: emptied where a view is found.
+        window: of the tracker.
         keyframes: of the window and its past.
         motion: predicts the view while the window has keyframes.
         matcher: finds keyframes in views.
@@ -57,7 +57,7 @@ class Relocaliser:
     min_inliers: int
 
     def relocalise(self, view: StereoView, after_gap: bool) -> Relocalisation | None:
-        """Finds the view and moves all keyframes of the window to the past; None, and no change, if it is nowhere.
+        """Finds the view; None if it is nowhere.
 
         Args:
             after_gap: in time, or in what images show: the last keyframe is asked, too. Without one, its landmarks are
@@ -83,10 +83,7 @@ class Relocaliser:
             admitted = view.only(self.admission.admit(view, pose, self.window))
             if not self.is_enough(admitted):
                 continue
-            while self.keyframes.active:
-                self.keyframes.marginalise_oldest(spare=keyframe)
-            covariance = from_origin(keyframe, relative).covariance
-            return Relocalisation(admitted, pose, covariance, self.keyframes.index(keyframe.origin))
+            return Relocalisation(admitted, pose, from_origin(keyframe, relative).covariance, keyframe)
         return None
 
     def is_enough(self, view: StereoView) -> bool:

@@ -30,7 +30,7 @@ class UnguidedMatcher:
     Attributes:
         window: whose calibration corrects the disparities.
         noise: of what is matched.
-        is_late: right eyes are; by an unknown velocity disparities of a view that is found are wrong, and not used.
+        is_late: right eyes are; disparities of views that are sought, which the velocity corrects, are not used.
     """
 
     camera: RectifiedStereo

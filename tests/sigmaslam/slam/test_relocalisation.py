@@ -521,6 +521,24 @@ def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("again", ["the place", "black"])
+def test_a_late_right_eye_finds_its_way_back_by_two_views(demo: Demo, again: str):
+    """One that is found alone leaves everything as it was."""
+    (camera, frames, _), delay = demo, 0.01
+    frames = delay_right(1e3 * delay, frames, np.random.default_rng(0))
+    tracker = StereoTracker(camera, config=TrackerConfig(window=2, keyframe_ratio=0.8), right_delay=delay)
+    black = np.zeros_like(frames[0].left)
+    for frame in [*frames[:21], *(mirrored(each, 6.0 + 0.05 * k) for k, each in enumerate(frames[8:20]))]:
+        tracker.step(frame.left, frame.right, frame.timestamp)
+    pairs = [(black, black)] * 4 + [(each.left, each.right) for each in frames[:6]]
+    if again == "black":
+        pairs[5:] = [(black, black)] * 4
+    found = [tracker.step(*pair, 6.6 + 0.05 * k).status for k, pair in enumerate(pairs)]
+    assert found[:5] == ["lost"] * 5
+    assert found[5:] == (["relocalised", *["tracking"] * 4] if again == "the place" else ["lost"] * 4)
+
+
+@pytest.mark.long
 def test_a_late_right_eye_finds_its_place_in_a_map(demo: Demo, demo_run: Path):
     """Disparities of a view are wrong by a velocity that two views show, once both are found."""
     (camera, frames, truth), delay = demo, 0.04
