@@ -59,9 +59,10 @@ def open_euroc(folder: Path, calibration: Path | None = None) -> StereoSequence:
 
 def _asl_images(camera: Path) -> dict[int, Path]:
     """Images of a camera by time stamp: the file name, or what data.csv says for that name."""
-    if (stamped := stamped_images(camera / "data")) is not None:
+    stamped, files, table = stamped_images(camera / "data"), list_images(camera / "data"), camera / "data.csv"
+    # Shorter names than of nanoseconds are rounded.
+    if stamped is not None and not (table.is_file() and any(len(path.stem) < 16 for path in files)):
         return stamped
-    files, table = list_images(camera / "data"), camera / "data.csv"
     try:
         lines = read_text(table, TABLE_BYTES, "the time stamps").splitlines()
         rows = [row for row in csv.reader(lines) if len(row) >= 2 and not row[0].startswith("#")]

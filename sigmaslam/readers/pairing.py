@@ -107,12 +107,15 @@ def pair_by_name(
     return [(left[key], right[key]) for key in frames if key in left and key in right], whole
 
 
-def _frame_keys(files: Sequence[Sequence[Path]]) -> list[list[Key]]:
+def _frame_keys(files: Sequence[Sequence[Path]]) -> Sequence[Sequence[Key]]:
     """The numbers in names, without one that is in all left names k and in all right ones k + 1: cam0_07, cam1_07."""
     keys = [[tuple(map(int, re.findall(r"\d+", path.stem))) for path in side] for side in files]
     places = zip(*([set(place) for place in zip(*side, strict=False)] for side in keys), strict=False)
-    cameras = {k for k, (left, right) in enumerate(places) if right == {min(left) + 1} and len(left) == 1}
-    return [[tuple(n for k, n in enumerate(key) if k not in cameras) for key in side] for side in keys]
+    cameras = {
+        k for k, (left, right) in enumerate(places) if len(left) == 1 and right == {min(left) + 1} <= {*range(9)}
+    }
+    rest = [[tuple(n for k, n in enumerate(key) if k not in cameras) for key in side] for side in keys]
+    return rest if all(len(key) for side in rest for key in side) else keys
 
 
 def frame_numbers(files: Sequence[tuple[Path, Path]]) -> list[int] | None:
@@ -140,7 +143,7 @@ def stamped_images(folder: Path) -> dict[int, Path] | None:
     """Images of a folder by the times in their names, nanoseconds; None where a name is no time."""
     files = list_images(folder)
     stamps = stamps_of([path.stem for path in files])
-    return None if stamps is None else dict(zip(stamps, files, strict=True))
+    return None if stamps is None or len({*stamps}) < len(files) else dict(zip(stamps, files, strict=True))
 
 
 def pair_by_stamp(

@@ -510,7 +510,7 @@ def test_the_number_of_the_camera_is_no_part_of_the_frame_s(tmp_path, names):
     np.testing.assert_array_equal(frames[10].right, picture(10, 1))
 
 
-@pytest.mark.parametrize("names", [("run1_{}", "run3_{}"), ("cam1_{}", "cam0_{}")])
+@pytest.mark.parametrize("names", [("run1_{}", "run3_{}"), ("cam1_{}", "cam0_{}"), ("20200101_{}", "20200102_{}")])
 def test_other_numbers_that_differ_are_no_camera_s(tmp_path, names):
     make_folder(tmp_path, 3)
     for side, name in zip(("left", "right"), names, strict=True):
