@@ -183,7 +183,7 @@ def interpolate_truth(estimate: Trajectory, truth: Trajectory) -> tuple[Trajecto
     distance, after = np.abs(times - stamps[paired]), np.searchsorted(stamps, times)
     width = np.diff(stamps, prepend=-np.inf, append=np.inf)[after]
     moved, alone = (distance > _SAME) & (width < _WIDEST), (distance > _SAME) & np.isinf(width)
-    if not moved.any():
+    if not moved.any() or len(paired) - alone.sum() < 2:
         return truth, None
     first, second = truth.rotations[after[moved] - 1], truth.rotations[after[moved]]
     turns = ((times - stamps[after - 1]) / width)[moved, None] * rotation_log(np.swapaxes(first, 1, 2) @ second)

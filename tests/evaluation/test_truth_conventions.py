@@ -333,3 +333,12 @@ def test_no_clock_is_blamed_for_noise_or_a_steady_motion(flight, noise: float):
     assert describe_clock_offset(estimate, Trajectory(truth.timestamps, truth.poses @ errors)) is None
     steady = spin(0.05 * np.arange(200))
     assert describe_clock_offset(steady, Trajectory(steady.timestamps + 0.1, steady.poses)) is None
+
+
+def test_two_poses_beside_two_of_the_truth_stay_a_step():
+    """Ends without a neighbour are left out only where two poses remain."""
+    times, poses = np.array([0.0, 0.1]), np.tile(np.eye(4), (2, 1, 1))
+    truth = Trajectory(times + [0.001, 0.002], poses)
+    kept, word = interpolate_truth(Trajectory(times, poses), truth)
+    assert kept is truth
+    assert word is None
