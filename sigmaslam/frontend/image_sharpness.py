@@ -79,9 +79,5 @@ def _inner_mean(values: np.ndarray, patches: np.ndarray) -> np.ndarray:
     return np.asarray(values.reshape(patches.shape)[:, inner, inner].mean(axis=(1, 2)))
 
 
-def _gaussian() -> np.ndarray:
-    weights = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _BLUR) ** 2)
-    return np.asarray((weights / weights.sum()).astype(np.float32))
-
-
-_KERNEL = _gaussian()
+_WEIGHTS = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _BLUR) ** 2)
+_KERNEL = np.asarray((_WEIGHTS / _WEIGHTS.sum()).astype(np.float32))

@@ -143,7 +143,9 @@ def fuse_depth(
     variance = np.float32(1.0 - shared) * reference.variance.ravel()[known]
     support, contradictions, visible, nearer, nearer_support = np.zeros((5, len(known)), np.uint8)
     cost = np.zeros_like(mean)
-    texture = [each.ravel()[known] for each in _texture(image.astype(np.float32))]
+    # Mean squared derivatives by u and v in the window of each pixel, grey values^2 / pixel^2.
+    wide, step = image.astype(np.float32), np.array([[-0.5, 0.0, 0.5]], np.float32)
+    texture = [window_mean(cv2.filter2D(wide, -1, each) ** 2).ravel()[known] for each in (step, step.T)]
     for view, pose, covariance in others:
         seen = _measure(view, pose, step_products(covariance), rays, mean, variance, camera)
         images = _compare(image, known, seen[0])
@@ -300,12 +302,6 @@ def _compare(image: np.ndarray, known: np.ndarray, grey: np.ndarray) -> tuple[li
     search.setFinestScale(0)
     flow = cv2.split(search.calc(small, moved, np.zeros((*small.shape, 2), np.float32)))
     return windows, [np.asarray(cv2.resize(each, image.shape[::-1])) for each in flow]
-
-
-def _texture(image: np.ndarray) -> np.ndarray:
-    """Mean squared derivatives by u and v in the window of each pixel, (2, H, W), grey values^2 / pixel^2."""
-    step = np.array([[-0.5, 0.0, 0.5]], np.float32)
-    return np.stack([window_mean(cv2.filter2D(image, -1, kernel) ** 2) for kernel in (step, step.T)])
 
 
 def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -57,12 +57,6 @@ def _has_numbers(*values: np.ndarray) -> bool:
     return any(bool(np.isfinite(each).any()) for each in values)
 
 
-def _is_wide(values: np.ndarray) -> bool:
-    """Whether the values need a logarithmic scale."""
-    values = values[np.isfinite(values) & (values > 0)]
-    return bool(len(values) and values.max() > _WIDE * np.median(values))
-
-
 def _sigmas(run: RecordedRun) -> list[dict[str, Any]]:
     """3 sigma of position and rotation, with their errors where there is a truth."""
     plots, errors = [], run.evaluated
@@ -75,7 +69,9 @@ def _sigmas(run: RecordedRun) -> list[dict[str, Any]]:
             error = scale * (errors.position_error if kind == "position" else errors.rotation_error)
             caption += " The error is that of the pose relative to the first one with a truth."
             series.append(_line("error", run.of_frames(error, errors.row), VERMILLION, width=2, compared="error"))
-        is_wide = _is_wide(np.concatenate([each["values"] for each in series]))
+        values = np.concatenate([each["values"] for each in series])
+        values = values[np.isfinite(values) & (values > 0)]
+        is_wide = bool(len(values) and values.max() > _WIDE * np.median(values))
         plots.append(_plot(f"Error of the {kind} [{unit}]", caption, series, log=is_wide))
     return plots
 

@@ -23,8 +23,6 @@ _FIELDS = 0.35
 # Differences of neighbouring lines over those of every other one: 0.56 to 0.69 in seven recordings, 0.98 in noise of 25
 # grey values, 1.3 to 22 where fields are interlaced, 2.5 to 23 where the pixels of a line have colours in turn.
 MAX_ALTERNATION = 1.15
-# Lines and half lines: noise in smaller images shows fields by chance (64x48: 111 of 200 pairs, 160x120: none).
-_LEAST_FIELD = 25
 # So many frames are looked at, then one in so many: a camera shows its fields whenever it moves.
 _LOOKED_AT = 8
 # Cells that are compared, down and across, and two sides of blocks in them, pixels.
@@ -126,7 +124,7 @@ def alternation(image: np.ndarray) -> float:
 def _shows_fields(image: np.ndarray) -> bool:
     """Whether odd rows of an (H, W) uint8 image are aside of what is between even ones, or nothing like it."""
     size = image.shape[1] // 2, (len(image) - 2) // 4
-    if min(size) < _LEAST_FIELD:
+    if min(size) < 25:  # in so few noise is by chance (64x48: 111 of 200 pairs, 160x120: none)
         return False
     above, odd, below = (cv2.resize(image[k::4][: size[1]], size) for k in range(3))
     between = cv2.addWeighted(above, 0.5, below, 0.5, 0.0, dtype=cv2.CV_32F)
