@@ -1,7 +1,7 @@
 """When frames were taken: time stamps are an observation of a clock, and their noise is in their intervals."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from statistics import median
 
 import numpy as np
@@ -63,15 +63,15 @@ class FrameClock:
     the noise of stamps, by which a stamp is measured. Stamps that can be believed are taken to the bit.
 
     Args:
-        has_sensor: one of motion predicts, and not the velocity alone.
+        sensors: of motion; without them the velocity alone predicts.
 
     Attributes:
         late: seconds by which the last interval is longer than usual, if the clock may have been set in it, or 0.
         was_blind: the frame before showed nothing; to be set by who sees it.
     """
 
-    def __init__(self, has_sensor: bool = False) -> None:
-        self._longest = np.inf if has_sensor else _LONGEST
+    def __init__(self, sensors: Sized = ()) -> None:
+        self._longest = np.inf if sensors else _LONGEST
         self._intervals: deque[float] = deque(maxlen=_REMEMBERED)
         self._is_believed, self._seconds, self.late, self.was_blind = True, 0.0, 0.0, False
 

@@ -79,5 +79,6 @@ def _inner_mean(values: np.ndarray, patches: np.ndarray) -> np.ndarray:
     return np.asarray(values.reshape(patches.shape)[:, inner, inner].mean(axis=(1, 2)))
 
 
+# Of a Gaussian.
 _WEIGHTS = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _BLUR) ** 2)
 _KERNEL = np.asarray((_WEIGHTS / _WEIGHTS.sum()).astype(np.float32))

@@ -124,11 +124,7 @@ class StereoTracker:
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = build_motion(backend, imu, odometry, turned)
         self._course = course = Course()
-        self._shared_errors, self._clock, self._last_pairs = (
-            SharedErrors(),
-            FrameClock(bool(motion.sensors)),
-            LastPairs(),
-        )
+        self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(motion.sensors), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
         self._frontend = frontend = load()
         update = FrameUpdate(window, config.iterations, bool(motion.sensors))

@@ -128,8 +128,8 @@ def test_an_interval_unlike_the_one_before_is_known_even_where_stamps_are_believ
     assert told == [(0.0, False), (0.0, True), (0.0, False)]
 
 
-@pytest.mark.parametrize(("has_sensor", "seconds"), [(False, 20.0), (True, 60.0)])
-def test_a_pause_is_extrapolated_as_far_as_a_velocity_alone_allows(has_sensor: bool, seconds: float):
+@pytest.mark.parametrize(("sensors", "seconds"), [((), 20.0), (("odometry",), 60.0)])
+def test_a_pause_is_extrapolated_as_far_as_a_velocity_alone_allows(sensors: tuple[str, ...], seconds: float):
     """Wheels tell where they went in all of it: over a part of it they would be surely wrong."""
-    clock = FrameClock(has_sensor)
+    clock = FrameClock(sensors)
     assert [clock.tick(step)[0] for step in (0.1, 60.0)] == [0.1, seconds]
