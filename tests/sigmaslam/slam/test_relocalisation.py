@@ -409,7 +409,8 @@ def test_an_array_in_place_of_a_map_is_refused_without_advice_to_unpickle(tmp_pa
 def test_no_place_is_found_that_the_motion_excludes(away: float, inliers: int, is_measured: bool, is_found: bool):
     relocaliser = relocaliser_where(range(2), 0.1 + away, inliers, is_measured)
     assert (relocaliser.relocalise(view_of(0, 80), after_gap=True) is not None) == is_found
-    assert len(relocaliser.window) == (0 if is_found else 1)
+    # Who goes on from there empties it.
+    assert len(relocaliser.window) == 1
 
 
 @pytest.mark.parametrize(("away", "inliers", "is_found"), [(0.01, 60, True), (0.01, 20, False), (5.0, 60, False)])
@@ -421,7 +422,7 @@ def test_a_view_is_found_in_the_last_keyframe_where_motion_and_many_features_agr
     found = relocaliser.relocalise(view_of(0, 80), after_gap=True)
     assert (found is not None) == is_found
     if found is not None:
-        assert found.origin == relocaliser.keyframes.index(1)
+        assert found.keyframe is relocaliser.keyframes.active[0]
         np.testing.assert_allclose(found.pose, looking(0.1 + away), atol=1e-12)
 
 
