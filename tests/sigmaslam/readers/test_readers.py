@@ -498,12 +498,17 @@ def test_thirteen_digits_with_steps_of_no_clock_since_1970_are_frame_numbers(tmp
     assert "10 Hz" in messages(caplog)[0]
 
 
+def rename_eyes(folder, names):
+    """Images of left and right get names (2,) that are formatted with their numbers."""
+    for side, name in zip(("left", "right"), names, strict=True):
+        for path in sorted((folder / side).iterdir()):
+            path.rename(path.with_name(f"{name.format(int(path.stem))}.png"))
+
+
 @pytest.mark.parametrize("names", [("cam0_{:04d}", "cam1_{:04d}"), ("{:d}_0", "{:d}_1"), ("2_a{}", "3_a{}")])
 def test_the_number_of_the_camera_is_no_part_of_the_frame_s(tmp_path, names):
     make_folder(tmp_path, 12)
-    for side, name in zip(("left", "right"), names, strict=True):
-        for path in sorted((tmp_path / side).iterdir()):
-            path.rename(path.with_name(f"{name.format(int(path.stem))}.png"))
+    rename_eyes(tmp_path, names)
     frames = read_all(tmp_path)[1]
     assert len(frames) == 12
     np.testing.assert_array_equal(frames[10].left, picture(10))
@@ -513,9 +518,7 @@ def test_the_number_of_the_camera_is_no_part_of_the_frame_s(tmp_path, names):
 @pytest.mark.parametrize("names", [("run1_{}", "run3_{}"), ("cam1_{}", "cam0_{}"), ("20200101_{}", "20200102_{}")])
 def test_other_numbers_that_differ_are_no_camera_s(tmp_path, names):
     make_folder(tmp_path, 3)
-    for side, name in zip(("left", "right"), names, strict=True):
-        for path in sorted((tmp_path / side).iterdir()):
-            path.rename(path.with_name(f"{name.format(int(path.stem))}.png"))
+    rename_eyes(tmp_path, names)
     with pytest.raises(InputError, match="3 in left without partner"):
         open_sequence(tmp_path)
 
