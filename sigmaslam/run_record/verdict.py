@@ -67,6 +67,7 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
         "calibration that is right within arm's reach, where boards are held: calibrate again",
         Doubt.TIME: "the image shows another moment than its stamp says, as if the driver exchanged frames",
         Doubt.MOTIONS: "two motions explain the image about as well: a torn image, or something large that moves",
+        Doubt.START: "the camera was shaken when tracking began, and what moves is hardly told from what rests",
     }
     # Of these the covariances say nothing, or not all.
     alone = {

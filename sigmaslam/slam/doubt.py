@@ -19,6 +19,7 @@ class Doubt(StrEnum):
     TIME = "image of another time"
     MOTIONS = "two motions"
     FIXED = "fixed in the image"
+    START = "shaken start"
 
 
 @dataclass(slots=True)

@@ -24,14 +24,15 @@ class Course:
         waiting_since: time stamp of the first view that could be a keyframe, blurred or not, seconds.
         started_at, tracked_at: time stamps of the first keyframe and of the last pose.
         found: pose (4, 4) of the last view that was found by a keyframe, T_world_camera, and its time stamp, seconds.
+        is_shaken: motion blurred an image before the first keyframe, or soon after it.
         is_shifted: the last pair showed a bump, and was skipped: that stays, an image gone wrong is one alone.
     """
 
     def __init__(self) -> None:
         self.phase = Phase.WAITING
         self.timestamp: float | None = None
-        self.waiting_since, self.is_shifted = inf, False
-        self.started_at = self.tracked_at = 0.0
+        self.waiting_since, self.is_shifted, self.is_shaken = inf, False, False
+        self.started_at, self.tracked_at = -inf, 0.0
         self.found = np.eye(4), -inf
 
     def start(self, timestamp: float) -> None:

@@ -84,6 +84,7 @@ class Recovery:
     def _waits(self, view: StereoView, timestamp: float) -> bool:
         """Whether a blurred first view, whose error would stay in all poses, should give way to a sharper one."""
         since = self.course.waiting_since = min(timestamp, self.course.waiting_since)
+        self.course.is_shaken |= view.is_blurred
         return timestamp - since < self.config.lost_seconds and view.is_blurred
 
     def resume(self, found: Relocalisation, timestamp: float, delay: float) -> KeyframeTracks | None:

@@ -20,9 +20,13 @@ from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.landmark_places import seen_apart
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.moving_region import MovingRegion
+from sigmaslam.slam.phase import Course
 from sigmaslam.slam.second_motion import SecondMotion, find_scene_behind, find_second_motion
 from sigmaslam.two_view.stereo_pose import MIN_POINTS
 
+# After a shaken start one keyframe hardly tells for so many seconds what moves: of these frames of 32 renders a twelfth
+# was beyond 99.9 %, of later ones none. Errors count as twice as large as matches say.
+_START, _START_VARIANCE = 0.5, 4.0
 # So many bodies, or parts of one, are left out of an image one by one.
 _MOST_MOVERS = 3
 
@@ -31,7 +35,7 @@ class Scrutiny:
     """Collects doubts in poses, frame by frame.
 
     Args:
-        localiser, clock: of the tracker.
+        localiser, clock, course: of the tracker.
         moving: where the scene moves on its own; None: all of it may.
         input_is_wrong: a check of the input found that the eyes do not fit.
 
@@ -40,10 +44,10 @@ class Scrutiny:
     """
 
     def __init__(
-        self, localiser: Localiser, clock: FrameClock, moving: MovingRegion | None, input_is_wrong: bool
+        self, localiser: Localiser, clock: FrameClock, course: Course, moving: MovingRegion | None, input_is_wrong: bool
     ) -> None:
         self._localiser, self._window, self._motion = localiser, localiser.window, localiser.motion
-        self._clock, self._moving = clock, moving
+        self._clock, self._course, self._moving = clock, course, moving
         # Places are all that is asked of it; a torn image leaves none in the next one.
         self._rival = MovingRegion(0.0, patience=0)
         self._T_rival_fit = self._parting = np.eye(4)
@@ -86,6 +90,12 @@ class Scrutiny:
             doubts.add(Doubt.APART)
         elif self._is_fixed(left, matches, fit):
             doubts.add(Doubt.FIXED)
+        course = self._course
+        if is_start := course.tracked_at < course.started_at + _START:
+            course.is_shaken |= frame.is_blurred
+        if is_start and course.is_shaken:
+            doubts.add(Doubt.START)
+            doubts.spread = doubts.spread + (_START_VARIANCE - 1.0) * fit.clustering * fit.relative
         if matches.rival is not None:
             doubts.add_motion(matches.rival, fit.pose)
         self._doubt_prediction(doubts, fit)

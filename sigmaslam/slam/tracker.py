@@ -132,7 +132,7 @@ class StereoTracker:
         self._unguided = unguided = UnguidedMatcher(rectified, frontend, window, noise, config, bool(right_delay))
         self._follower = follower = LandmarkFollower(guided)
         self._localiser = localiser = Localiser(window, motion, update, guided, follower, unguided, config, self._clock)
-        self._scrutiny = Scrutiny(localiser, self._clock, admission.moving, disparity_error is not None)
+        self._scrutiny = Scrutiny(localiser, self._clock, course, admission.moving, disparity_error is not None)
         self._mapper = Mapper(rectified, window, keyframes, motion, noise, admission, config)
         self._loops = LoopCloser(window, keyframes, unguided)
         self._relocaliser = Relocaliser(window, keyframes, motion, unguided, admission, config.min_inliers)

@@ -20,6 +20,7 @@ from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Localiser
 from sigmaslam.slam.moving_region import MovingRegion
+from sigmaslam.slam.phase import Course
 from sigmaslam.slam.scrutiny import Scrutiny
 from sigmaslam.slam.second_motion import _among, _most_departing, find_scene_behind
 from sigmaslam.two_view.scene_pose import see_the_same
@@ -114,7 +115,8 @@ def test_far_parts_do_not_side_with_a_prediction_that_the_image_contradicts(seed
 def test_a_body_that_moves_by_too_little_to_be_told_is_in_the_covariance(seed: int) -> None:
     """A pixel: nothing is left out, and the pose that the body draws along stays the frame's."""
     localiser, matches, fit = scene(seed, [-0.004, 0.0, 0.0])
-    kept, same, doubts = Scrutiny(localiser, FrameClock(), MovingRegion(8.0, 10), False).doubt(black(), matches, fit)
+    scrutiny = Scrutiny(localiser, FrameClock(), Course(), MovingRegion(8.0, 10), False)
+    kept, same, doubts = scrutiny.doubt(black(), matches, fit)
     assert kept is matches
     assert same is fit
     error = se3_log(POSE @ se3_inverse(fit.pose))
@@ -127,7 +129,7 @@ def test_a_pose_that_a_body_draws_far_along_is_as_uncertain_as_the_others_know_i
     moving = MovingRegion(8.0, 10)
     for way, spoils, most in ((-0.008, True, 2.0), (-0.004, False, 8.0)):
         localiser, matches, fit = scene(2, [way, 0.0, 0.0])
-        _, same, doubts = Scrutiny(localiser, FrameClock(), moving, False).doubt(black(), matches, fit)
+        _, same, doubts = Scrutiny(localiser, FrameClock(), Course(), moving, False).doubt(black(), matches, fit)
         assert same is fit
         assert doubts.spoils_keyframe == spoils
         assert doubts.status == "tracking"
