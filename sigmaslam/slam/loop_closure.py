@@ -78,7 +78,8 @@ class LoopCloser:
             return None
         self.looked = newest.timestamp
         relative = self.matcher.confirmed_pose_to(keyframe.view, newest.view)
-        if relative is None:
+        # Farther away errors of the calibration move it by more than the matches tell, and the scene hides the place.
+        if relative is None or np.linalg.norm(relative.T_key_camera[:3, 3]) > self.window.depth:
             return None
         index, relative = self.keyframes.index(keyframe.origin), from_origin(keyframe, relative)
         pose, measured = state.past.poses[index], relative.T_key_camera

@@ -25,6 +25,7 @@ from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.loop_closure import LoopCloser
 from sigmaslam.slam.relative_poses import SPANS
 from sigmaslam.slam.tracker import StereoTracker
+from sigmaslam.two_view.stereo_pose import RelativePose
 from sigmaslam_evaluation.metrics.trajectory_errors import absolute_trajectory_error
 from tests.support.quantiles import chi_square_median, squared_sigmas
 from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, frame_of, run_simulated
@@ -251,3 +252,19 @@ def test_loops_are_sought_as_far_as_a_bad_calibration_makes_the_place_uncertain(
     for window.worse in (1.0, 3.0):
         found.append(LoopCloser(window, keyframes, None)._revisited(newest)[0])
     assert found == [None, old]
+
+
+@pytest.mark.parametrize(("away", "is_closed"), [(0.9, True), (1.1, False)])
+def test_no_loop_is_closed_across_more_than_the_depth_of_the_scene(
+    monkeypatch: pytest.MonkeyPatch, away: float, is_closed: bool
+):
+    """Errors of the calibration would move the far keyframe by more than the matches tell."""
+    seen = RelativePose(se3_exp(np.array([0, 0, away, 0, 0, 0])), np.ones(9, bool), np.eye(6) * 1e-4, 1.0)
+    state = SimpleNamespace(past=SimpleNamespace(poses=np.eye(4)[None]), poses=seen.T_key_camera[None])
+    window = SimpleNamespace(posterior=state, depth=1.0, add_loop_constraint=lambda *loop: True)
+    old = SimpleNamespace(id=0, timestamp=3.0, view=None, origin=0)
+    keyframes = SimpleNamespace(active=[SimpleNamespace(timestamp=9.0, view=None)], index=lambda id: id)
+    closer = LoopCloser(window, keyframes, SimpleNamespace(confirmed_pose_to=lambda key, view: seen))
+    monkeypatch.setattr(LoopCloser, "_revisited", lambda self, newest: (old, 0.0))
+    monkeypatch.setattr(loop_closure, "from_origin", lambda keyframe, relative: relative)
+    assert (closer.close() == 3.0) == is_closed
