@@ -74,6 +74,8 @@ def _match(search: KeypointSearch, start: np.ndarray, left: np.ndarray, right: n
 
 
 def _disparity(left: np.ndarray, right: np.ndarray, points: np.ndarray) -> np.ndarray:
+    if not right.size:  # of a keyframe in a map
+        return np.full(len(points), np.nan)
     places, tracked = follow_both_ways(left, right, points, points)
     disparity = points[:, 0] - places[:, 0]
     level = tracked & (np.abs(places[:, 1] - points[:, 1]) <= ROW_TOLERANCE) & (disparity > -2.0)
