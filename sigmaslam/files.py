@@ -112,8 +112,8 @@ def atomic_write_json(path: str | Path, content: dict[str, Any]) -> None:
 
 def save_arrays(path: str | Path, **arrays: Any) -> None:
     """Write arrays by name as a compressed .npz; see `atomic_path`."""
-    with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, **arrays)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:  # to a path numpy adds .npz
+        np.savez_compressed(file, **arrays)
 
 
 def save_array(path: str | Path, array: np.ndarray) -> None:

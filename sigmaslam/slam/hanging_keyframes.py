@@ -1,5 +1,7 @@
 """Thousands of keyframes beside the few whose poses are remembered together: each hangs at one of these."""
 
+from collections import Counter
+
 import numpy as np
 
 from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe
@@ -23,7 +25,7 @@ def hang_over(
 
     Args:
         hanging: all of them by their numbers; changed.
-        most: at one neighbour; of the two that are closest to each other the later one is forgotten.
+        most: of all; of the two that are closest to each other where most hang the later one is forgotten.
         heir: number of the other one.
         step: (4, 4) T_heir_leaving.
         covariance: (6, 6) of that, perturbed from the left in the heir.
@@ -35,9 +37,10 @@ def hang_over(
     hanging[leaving.id] = own
     moved = [each for each in hanging.values() if each.origin == leaving.id]
     hanging |= {each.id: each.handed_over(heir, step, covariance) for each in moved}
-    group = sorted(each.id for each in hanging.values() if each.origin == heir)
     forgotten = []
-    while len(group) > most:
-        forgotten.append(group.pop(closest_pair(np.array([hanging[id].step for id in group]))[1]))
+    while len(hanging) > most:
+        origin = Counter(each.origin for each in hanging.values()).most_common(1)[0][0]
+        group = sorted(each.id for each in hanging.values() if each.origin == origin)
+        forgotten.append(group[closest_pair(np.array([hanging[id].step for id in group]))[1]])
         del hanging[forgotten[-1]]
     return forgotten

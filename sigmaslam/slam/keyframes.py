@@ -60,7 +60,7 @@ class Keyframes:
         self._next_id = self._first_id = 0
         self.active: list[Keyframe] = []
         self.remembered: list[Keyframe] = []
-        self._most_hanging = max_keyframes // self._most_remembered - 1
+        self._most_hanging = max(max_keyframes, 1) - self._most_remembered
         self.hanging: dict[int, HangingKeyframe] = {}
         self.appearance = AppearanceIndex()
 

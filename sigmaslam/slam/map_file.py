@@ -48,7 +48,9 @@ _KINDS = {
     **{_PREFIX + "images": "u", _PREFIX + "descriptors": "i", "frontend": "U"},
 }
 _FINITE = (*_PER_FEATURE, "disparity", "disparity_sigma")
-_MEND = "map the place again with `sigmaslam track`"
+# Takes points of the left camera into the rectified one, whose world keyframes are in.
+TURN = "T_rectified_left"
+MEND = "map the place again with `sigmaslam track`"
 # Round-off leaves rotations, and covariances relative to their variances, better than this.
 _ORTHONORMAL, _SYMMETRY = 1e-6, 1e-3
 
@@ -86,14 +88,14 @@ def pack_keyframes(
 
 
 def read_keyframes(
-    path: Path, frontend: str, camera: RectifiedStereo
+    path: Path, frontend: str | None = None, camera: RectifiedStereo | None = None
 ) -> tuple[list[Keyframe], PastPoses, list[HangingKeyframe]]:
     """Keyframes of a map file.
 
     Args:
         path: map.npz of a run, or its folder.
-        frontend: that is going to match them.
-        camera: the rectified pair that is going to see them.
+        frontend: that is going to match them; None: its own.
+        camera: the rectified pair that is going to see them; None: its own.
     Returns:
         The keyframes, numbered from zero, their poses together, and keyframes that hang at them.
     Raises:
@@ -106,13 +108,13 @@ def read_keyframes(
         raise InputError(
             f"{path}: a map without keyframes to find ({missing[0]} is missing); make it by a run of several keyframes"
         )
-    check_columns(path, arrays, _SHAPES, _KINDS, _MEND)
-    if str(arrays["frontend"]) != frontend:
+    check_columns(path, arrays, _SHAPES, _KINDS, MEND)
+    if frontend is not None and str(arrays["frontend"]) != frontend:
         other = shorten(str(arrays["frontend"]))
         raise InputError(
             f"{path}: made with the front-end {other}, not {frontend}; give --frontend {other}, or map again"
         )
-    expected = _intrinsics(camera)
+    expected = arrays["intrinsics"] if camera is None else _intrinsics(camera)
     if not np.allclose(arrays["intrinsics"], expected, rtol=1e-4):
         raise InputError(
             f"{path}: its camera has fx, fy, cx, cy, baseline, width, height of {arrays['intrinsics'].tolist()}, this "
@@ -125,7 +127,7 @@ def read_keyframes(
             "with --frontend learned to be found anywhere",
             *(path, frontend),
         )
-    array = {name.removeprefix(_PREFIX): value for name, value in arrays.items()}
+    array = {name.removeprefix(_PREFIX): arrays[name] for name in _SHAPES}  # points have time stamps, too
     features = Features(*(array[name] for name in _PER_FEATURE))
     ends, image_ends = (np.cumsum(array[name].astype(np.int64)) for name in ("counts", "image_bytes"))
     keyframes: list[Keyframe] = []
@@ -151,9 +153,9 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
     def refuse(wrong: bool, name: str, what: str) -> None:
         if wrong:
-            raise InputError(f"{path}: {_PREFIX}{name} {what}; {_MEND}")
+            raise InputError(f"{path}: {_PREFIX}{name} {what}; {MEND}")
 
-    array = {name.removeprefix(_PREFIX): value for name, value in arrays.items()}
+    array = {name.removeprefix(_PREFIX): arrays[name] for name in _SHAPES}  # points have time stamps, too
     poses, covariance, origins = array["poses"], array["covariance"], array["origins"]
     count, joint = len(poses), len(covariance) // 6
     refuse(array["images"].dtype != np.uint8, "images", f"are {array['images'].dtype}, not uint8")

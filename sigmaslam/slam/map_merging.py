@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmaslam.bounded_files import load_arrays
+from sigmaslam.bounded_files import check_columns, load_arrays
 from sigmaslam.errors import InputError
 from sigmaslam.estimation.calibration_errors import CalibrationPrior
 from sigmaslam.estimation.chi_square import CHI_SQUARE_9999_OF_6
@@ -21,13 +21,17 @@ from sigmaslam.progress import counted
 from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe, from_origin
-from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
+from sigmaslam.slam.map_file import MEND, TURN, pack_keyframes, read_keyframes
 from sigmaslam.slam.measurement_noise import MeasurementNoise
 from sigmaslam.slam.packed_view import PackedView
 from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.point_map import PointMap, hand_over_points, merge_maps
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    **dict.fromkeys(("observations", "timestamps", "intensity"), ("M",)),
+    **{"points": ("M", 3), "covariances": ("M", 3, 3), "pixels": ("M", 2), TURN: (4, 4)},
+}
 # Keyframes of the first map that look most like one of the second.
 _CANDIDATES = 3
 
@@ -43,14 +47,13 @@ class MapFile:
 
     def __init__(self, path: Path) -> None:
         path = path / "map.npz" if path.is_dir() else path
-        arrays = load_arrays(path, "give map.npz of a run of `sigmaslam track`")
-        if "intrinsics" not in arrays:
-            raise InputError(f"{path}: a map without keyframes to find")
-        self.path, self.frontend = path, str(arrays["frontend"])
+        self.keyframes, self.past, self.hanging = read_keyframes(path)
+        arrays = {TURN: np.eye(4), **load_arrays(path, MEND), **load_arrays(path, MEND, PointMap.__slots__)}
+        check_columns(path, arrays, _SHAPES, {"observations": "iu"}, MEND)
+        self.path, self.frontend, self.T_rectified_left = path, str(arrays["frontend"]), arrays[TURN]
         fx, fy, cx, cy, baseline, width, height = arrays["intrinsics"].tolist()
         self.camera = RectifiedStereo(fx, fy, cx, cy, baseline, round(width), round(height))
         self.points = PointMap(**{name: arrays[name] for name in PointMap.__slots__})
-        self.keyframes, self.past, self.hanging = read_keyframes(path, self.frontend, self.camera)
 
     @property
     def known(self) -> list[Keyframe | HangingKeyframe]:
@@ -100,9 +103,14 @@ def merge(one: MapFile, other: MapFile) -> dict[str, np.ndarray]:
         known.append(HangingKeyframe(number, each.timestamp, packed, link.origin, T_origin_each, spread))
     T_one_origin = one.past.poses[link.origin]
     T_one_other = nearest_rigid(T_one_origin @ link.T_key_camera @ se3_inverse(other.pose(found)))
-    points = hand_over_points(other.points, T_one_other, turn_covariance(T_one_origin, covariance))
-    merged = merge_maps([one.points, points])
-    arrays = {name: getattr(merged, name) for name in PointMap.__slots__}
+    # Points are in the worlds of the left cameras, keyframes in those of the rectified ones.
+    T_left_one = se3_inverse(one.T_rectified_left)
+    step, spread = (
+        T_left_one @ T_one_other @ other.T_rectified_left,
+        turn_covariance(T_left_one @ T_one_origin, covariance),
+    )
+    merged = merge_maps([one.points, hand_over_points(other.points, step, spread)])
+    arrays = {TURN: one.T_rectified_left, **{name: getattr(merged, name) for name in PointMap.__slots__}}
     return arrays | pack_keyframes(one.keyframes, one.past, one.frontend, one.camera, [*one.hanging, *known])
 
 

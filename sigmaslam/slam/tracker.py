@@ -40,6 +40,7 @@ from sigmaslam.slam.landmark_admission import AdmitAll, LandmarkAdmission
 from sigmaslam.slam.landmark_following import LandmarkFollower
 from sigmaslam.slam.localisation import Localiser, Prediction
 from sigmaslam.slam.loop_closure import LoopCloser
+from sigmaslam.slam.map_file import TURN
 from sigmaslam.slam.mapping import Mapper
 from sigmaslam.slam.matched_frame import MatchedFrame
 from sigmaslam.slam.measurement_noise import MeasurementNoise
@@ -113,8 +114,7 @@ class StereoTracker:
             load = beside.submit(load).result
             beside.shutdown(wait=False)
         self.rectifier = StereoRectifier(camera)
-        self._camera = rectified = self.rectifier.rectified
-        self._T_rectified_left = turned = self.rectifier.T_rectified_left
+        self._camera, turned = (rectified := self.rectifier.rectified), self.rectifier.T_rectified_left
         self._blas = ThreadpoolController()
         self._admission = admission = admission or AdmitAll(config.min_inliers, config.spacing)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
@@ -247,7 +247,7 @@ class StereoTracker:
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
-        return self._keyframes.map().transform(se3_inverse(self._T_rectified_left))
+        return self._keyframes.map().transform(se3_inverse(self.rectifier.T_rectified_left))
 
     def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
         """All frames with a pose so far as they are known now, with covariances (N, 6, 6) in the camera's own frame."""
@@ -255,7 +255,7 @@ class StereoTracker:
 
     def pack_keyframes(self) -> dict[str, Any]:
         """Keyframes by which a later run finds its place in the map, as arrays by name."""
-        return self._keyframes.pack(self._frontend.name, self._camera)
+        return {TURN: self.rectifier.T_rectified_left, **self._keyframes.pack(self._frontend.name, self._camera)}
 
     def _localise(
         self, frame: Frame, timestamp: float, clock: Stopwatch, doubts: Doubts

@@ -16,16 +16,19 @@ from sigmaslam.estimation.marginalised_poses import PastPoses
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import Features, StereoView
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
+from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, transform_points
 from sigmaslam.readers.trajectory_files import read_kitti
+from sigmaslam.slam import map_merging
 from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.keyframe import HangingKeyframe, Keyframe, from_origin
 from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.landmark_admission import AdmitAll
 from sigmaslam.slam.map_file import pack_keyframes, read_keyframes
+from sigmaslam.slam.map_merging import MapFile
 from sigmaslam.slam.packed_view import PackedView
 from sigmaslam.slam.place_recognition import retrieve
+from sigmaslam.slam.point_map import PointMap
 from sigmaslam.slam.relocalisation import Relocaliser
 from sigmaslam.slam.tracker import TrackerConfig
 from sigmaslam.two_view.stereo_pose import RelativePose
@@ -262,6 +265,61 @@ def test_no_more_keyframes_hang_than_are_asked_for(most: int):
     assert 0.6 * most <= len(known) <= most
     assert len(keyframes.appearance) == len(known)
     assert {each.origin for each in known} <= {each.id for each in keyframes.remembered}
+
+
+@pytest.mark.long
+def test_keyframes_are_forgotten_where_most_hang_and_only_for_want_of_room(tmp_path: Path):
+    """All of a map that was joined hang at one keyframe."""
+    arrays = walked(0.1 * np.arange(150), 240).pack("learned", CAMERA)
+    arrays["keyframe_origins"][61:] = 7
+    np.savez_compressed(tmp_path / "map.npz", **arrays)
+    keyframes = walked(0.1 * np.arange(75) + 15.0, 240, tmp_path / "map.npz", first=150)
+    assert len(keyframes.left_long_ago()) == 149 + 75
+    keyframes = walked(0.1 * np.arange(120) + 15.0, 240, tmp_path / "map.npz", first=150)
+    assert len(keyframes.left_long_ago()) == 240
+    gone = set(range(268)) - {each.id for each in keyframes.left_long_ago()}
+    assert all(60 <= id < 149 for id in gone)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"points": None}, "points"),
+        ({"pixels": np.zeros((3, 3))}, "pixels"),
+        ({"intrinsics": np.ones(6)}, "intrinsics"),
+        ({"intrinsics": np.full(7, np.nan)}, "nan"),
+        ({"T_rectified_left": np.ones(3)}, "T_rectified_left"),
+    ],
+)
+def test_a_damaged_map_is_named_before_it_is_merged(tmp_path: Path, changed: dict[str, np.ndarray | None], said: str):
+    points = {name: getattr(PointMap.empty(), name) for name in PointMap.__slots__}
+    arrays = {**walked(0.1 * np.arange(3)).pack("learned", CAMERA), **points}
+    np.savez_compressed(tmp_path / "map.npz", **arrays)
+    assert "keyframes  3 within" in MapFile(tmp_path).describe()
+    arrays = {name: value for name, value in {**arrays, **changed}.items() if value is not None}
+    np.savez_compressed(tmp_path / "map.npz", **arrays)
+    with pytest.raises(InputError, match=said):
+        MapFile(tmp_path)
+
+
+def test_points_of_left_cameras_are_turned_like_their_keyframes(monkeypatch: pytest.MonkeyPatch):
+    """Maps of a rig that is rectified by a turn: keyframes are in the world of the rectified camera."""
+    turn, T = se3_exp(np.array([0, 0, 0, 0.01, -0.02, 0.3])), se3_exp(np.array([2.0, 0, 1.0, 0, 0.4, 0]))
+    point = np.array([[1.0, 2.0, 5.0]])
+    points = replace(PointMap.empty(), points=point, covariances=np.zeros((1, 3, 3)))
+    points = replace(points, **{name: np.zeros(1) for name in ("observations", "timestamps", "intensity")})
+    points = replace(points, pixels=np.zeros((1, 2)))
+    key = Keyframe(0, 0.0, view_of(0))
+    shared = {"frontend": "learned", "path": Path("map.npz"), "camera": CAMERA, "T_rectified_left": turn}
+    shared |= {"keyframes": [key], "hanging": [], "known": [key], "past": ONE_POSE, "pose": lambda keyframe: np.eye(4)}
+    one, other = (SimpleNamespace(points=each, **shared) for each in (PointMap.empty(), points))
+    monkeypatch.setattr(map_merging, "read_keyframes", lambda *arguments: None)
+    monkeypatch.setattr(map_merging, "_find", lambda *maps: (key, map_merging.Link(0, T, np.zeros((6, 6)), 99)))
+    merged = map_merging.merge(one, other)
+    seen = transform_points(se3_inverse(turn) @ T @ turn, point)
+    np.testing.assert_allclose(merged["points"], seen, atol=1e-12)
+    np.testing.assert_array_equal(merged["T_rectified_left"], turn)
 
 
 @pytest.mark.long
