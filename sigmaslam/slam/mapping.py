@@ -139,6 +139,8 @@ class Mapper:
             # Its velocity is that of the images, and off alike in all steps of a window: together they know one way.
             shared = np.sqrt(np.repeat([self.config.window, 1.0], 3))
             covariance = shared[:, None] * covariance * shared
+            if doubts.prediction_is_wrong:  # as after a sample gone wrong: it would bend the window
+                step = fit.step
         # Streaks hide what moves, and it draws the pose: frames that see the keyframe's landmarks share that.
         drawn = 0.0 if Doubt.TIME in doubts.reasons else doubts.spread  # the image's own pose knows of no stamp
         spread = matches.streaked * (drawn + (1.0 - 1.0 / fit.clustering) * fit.relative)
