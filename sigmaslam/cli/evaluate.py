@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from sigmaslam.plot_style import NO_MATPLOTLIB
+from sigmaslam.plot_style import NO_MATPLOTLIB, has_matplotlib
 
 
 def evaluate(
@@ -61,5 +61,5 @@ def evaluate(
         truth_kind=truth_kind,
     )
     typer.echo(json.dumps(evaluation.to_dict(), indent=2) if as_json else format_evaluation(evaluation))
-    if evaluation.figure_path is None:
+    if not has_matplotlib():
         typer.echo(f"No picture: {NO_MATPLOTLIB}", err=True)

@@ -26,7 +26,6 @@ from sigmaslam.inference.backends import backend_names
 from sigmaslam.inference.session import check_provider
 from sigmaslam.plot_style import NO_MATPLOTLIB
 from sigmaslam.readers import StereoSequence
-from sigmaslam.run_record.removal import remove_run
 from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
 
 if TYPE_CHECKING:
@@ -221,8 +220,6 @@ def track(
         check_new_folder(out, "--out, give --overwrite or --resume")
     with open_sinks(request.live, out, sequence.camera) as sinks:
         findings = _check(sequence, strict, threads)
-        if overwrite:
-            remove_run(out)
         opened = InputOptions(sequence, findings=findings)
         tell_summary(_track(replace(request, input=opened, live=LiveOptions(sinks=sinks))), out)
 

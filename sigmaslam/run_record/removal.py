@@ -44,10 +44,11 @@ def remove_run(folder: Path) -> None:
         raise InputError(f"{folder}: holds {others[0]}, which no run has written: move it, or choose another --out")
     if (folder / PARTIAL_POSES).is_file():
         check_not_in_use(folder / PARTIAL_POSES)
-    for path in leftovers:
-        path.unlink(missing_ok=True)
-    for name in _NAMES:
-        (folder / name).unlink(missing_ok=True)
+    try:
+        for path in (*leftovers, *(folder / name for name in _NAMES)):
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be removed ({error.strerror}): choose another --out") from None
 
 
 def remove_results(folder: Path) -> None:

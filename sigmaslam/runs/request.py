@@ -112,7 +112,7 @@ class OutputOptions:
     Attributes:
         out: the folder, new or empty.
         tracks: write tracks.npz, too, the observations of keyframes for `sigmaslam map refine`.
-        overwrite: the command removes the run in the folder first.
+        overwrite: a run in the folder is removed before the first frame.
         resume: `out` holds a run of the same input that was stopped or killed, which goes on where it was. The map is
             then that of the frames from its last keyframe on, and there is no trajectory after the fact.
         save_calibration: a calibration file, new, for what the run learns of its own.

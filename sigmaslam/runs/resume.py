@@ -35,7 +35,10 @@ from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.table import nearest_rows
 
 # What must be as it was; paths and settings of the command line.
-_SAME = ("input", "format", "frontend", "backend", "provider", "weights", "mask", "configuration", "calibration")
+_SAME = (
+    *("input", "format", "frontend", "backend", "provider", "weights", "mask", "configuration", "calibration"),
+    *("imu", "odometry"),
+)
 # Frames lie further apart, seconds; frames.csv and trajectory.tum round time stamps.
 _SAME_TIME = 1e-6
 
@@ -165,8 +168,9 @@ def _check_entries(folder: Path, entries: dict[str, Any], run: dict[str, Any]) -
         if entries.get(name) is not None:
             raise InputError(f"{folder}: a run with {option} cannot go on: track anew with --overwrite")
     for name in _SAME:
-        if entries.get(name) != run[name]:
-            values = f" ({entries.get(name)}, now {run[name]})" if isinstance(run[name], str) else ""
+        had, has = entries.get(name), run.get(name)
+        if had != has:
+            values = f" ({had}, now {has})" if isinstance(has or had, str) else ""
             raise InputError(f"{folder / RUN_NAME}: had another {name}{values}: give the same, or another --out")
 
 

@@ -26,6 +26,7 @@ from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import write_tum
 from sigmaslam.run_record.frame_pictures import PictureRecorder
 from sigmaslam.run_record.real_time import FrameTiming
+from sigmaslam.run_record.removal import remove_run
 from sigmaslam.run_record.run_folder import RunWriter, describe_camera, describe_weights
 from sigmaslam.runs.denoise import StereoFilter
 from sigmaslam.runs.request import TrackerOptions, TrackRequest
@@ -80,6 +81,8 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         run["object"] = {"region": options.track_object, "origin": None}  # which the first frame gives
     if stopped is not None:
         stopped.make_ready()
+    if request.outputs.overwrite:  # now that all it asks for is read: its map, too
+        remove_run(out)
     writer = RunWriter(out, run, rectified, None if stopped is None else len(stopped.records))
     pictures = PictureRecorder(sequence.length)
     images = StereoFilter() if options.denoise else None
@@ -246,7 +249,7 @@ def _collect_results(
     # A sensor's readings correct poses as they come, not after the fact; what was before a stop is not in memory.
     final = tracker.final_trajectory if location is None and not goes_on else None
     judge_imu = None
-    if sequence.imu is not None and location is None:
+    if sequence.imu is not None and location is None and isinstance(tracker, StereoTracker):
         judge_imu = partial(judge_motion, recording=sequence.imu)
     return TrackerResults(tracker.map, tracker.pack_keyframes, final, others, pictures.write, judge_imu)
 

@@ -13,6 +13,7 @@ from sigmaslam.readers.trajectory_files import read_kitti, read_trajectory, read
 from sigmaslam.run_record.evaluated_frames import read_evaluated_frames
 from sigmaslam_evaluation.evaluation_summary import format_evaluation
 from sigmaslam_evaluation.run_evaluation import evaluate_run
+from tests.support.commands import run_here
 
 
 def make_run(folder: Path, truth: Trajectory, seed: int = 0) -> None:
@@ -185,6 +186,9 @@ def test_a_picture_that_cannot_be_written_costs_a_warning_alone(drive, monkeypat
     assert evaluation.figure_path is None
     assert evaluation.matched == 186
     assert "evaluation.png is not written: No space left on device" in caplog.text
+    told = run_here("evaluate", drive[0], "--truth", drive[1])
+    assert told.returncode == 0
+    assert "No picture" not in told.stderr
 
 
 @pytest.mark.long

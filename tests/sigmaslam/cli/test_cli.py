@@ -116,6 +116,23 @@ def test_a_part_of_a_recording_is_tracked_in_small_and_may_replace_an_earlier_ru
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("without_report")
+def test_a_run_is_replaced_when_all_that_the_new_one_asks_for_is_read(whole_sequence: Path, tmp_path: Path):
+    """Its own map, too."""
+    out, few = tmp_path / "run", ("--frames", "12", "--overwrite")
+    assert run_here("track", whole_sequence, "--out", out, *few).returncode == 0
+    before = (out / "map.npz").read_bytes()
+    assert_refused(run_here("track", whole_sequence, "--out", out, *few, "--map", "none.npz"), "none.npz")
+    assert_refused(
+        run_here("track", whole_sequence, "--out", out, *few, "--map", out, "--frontend", "sift"), "--frontend"
+    )
+    assert (out / "map.npz").read_bytes() == before
+    assert run_here("track", whole_sequence, "--out", out, *few, "--map", out).returncode == 0
+    assert (out / "map.npz").stat().st_size > 1.2 * len(before)
+    assert "relocalised" in rows(out)[0]
+
+
+@pytest.mark.long
 def test_two_runs_are_identical_to_the_bit(whole_sequence: Path, tracked: tuple[Path, Finished], tmp_path: Path):
     assert run_process("track", whole_sequence, "--out", tmp_path / "again").returncode == 0
     for name in ("trajectory.tum", "trajectory.kitti", "covariance.npy", "map.ply"):

@@ -73,3 +73,12 @@ def test_a_run_that_goes_on_is_not_removed(run: Path):
     writer.close()
     remove_run(run)
     assert not any(run.iterdir())
+
+
+def test_what_cannot_be_removed_is_named(run: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(path: Path, missing_ok: bool) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(InputError, match=r"frames\.csv: cannot be removed \(Permission denied\): choose another --out"):
+        remove_run(run)

@@ -17,6 +17,7 @@ from sigmaslam.readers.selection import Selection
 from sigmaslam.readers.trajectory_files import read_tum
 from sigmaslam.run_record.frame_table import read_frames
 from sigmaslam.run_record.relative_pose_file import read_frame_pairs
+from sigmaslam.runs.resume import _SAME, _check_entries
 from tests.support.commands import assert_refused, run_here
 from tests.support.demo_parts import copy_frames
 from tests.support.stopped_runs import end, start, statuses
@@ -140,6 +141,8 @@ def test_another_input_or_other_settings_are_refused_and_change_nothing(
         track(demo_sequence, run, "klt", resume=True)
     with pytest.raises(InputError, match="had another frontend \\(klt, now orb\\)"):
         track(sequence, run, "orb", resume=True)
+    with pytest.raises(InputError, match=r"had another imu \(None, now imu\.csv\)"):
+        _check_entries(run, {"map": None}, {name: "imu.csv" if name == "imu" else None for name in _SAME})
     for selection in (Selection(start=1), Selection(every=2), Selection(count=5)):
         with pytest.raises(InputError, match="run of other frames"):
             track(open_sequence(sequence).select(selection), run, "klt", resume=True)
