@@ -93,5 +93,9 @@ def _read_messages(bag: BagReader, topic: str) -> tuple[np.ndarray, np.ndarray]:
             rate, force = message.angular_velocity, message.linear_acceleration
             values[k] = rate.x, rate.y, rate.z, force.x, force.y, force.z
             progress.update(task, completed=k + 1)
+    whole = np.isfinite(values).all(axis=1)
+    if not whole.all():
+        _LOGGER.warning("%s: %d messages have values that are not finite: left out", topic, (~whole).sum())
+        stamps, recorded, values = stamps[whole], recorded[whole], values[whole]
     # Drivers without a clock leave the stamps of the headers at zero.
     return recorded if not stamps.any() else stamps, values
