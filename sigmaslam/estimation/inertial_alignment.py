@@ -31,6 +31,8 @@ _LEAST_PLACE, _LEAST_TURN = 2e-4, 2e-4
 # Gravity whose length is off by more than three sigmas and this was not found, m/s^2; nor was one whose direction is
 # less certain, radians.
 _LENGTH_TOLERANCE, _LEAST_TILT_CERTAINTY = 0.5, 0.05
+# Forces have the wrong sign where the other one leaves less than this share of the variance: MH01 0.08 to 0.2, or 11.
+_WRONG_SIGN = 1 / 4
 # Seconds of images without gravity after which it is said.
 _PATIENCE = 3.0
 # Turns of gyro and images that differ by more are not of one body: of the turns, and radians from frame to frame.
@@ -116,6 +118,13 @@ def align(
     return Alignment(found[:3], found[3:6], found[6:], covariance + columns @ columns.T, columns * sensor_sigma)
 
 
+def has_wrong_sign(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> bool:
+    """Whether forces of the other sign fit the path better, which give gravity's length as well; as of `gyro_fits`."""
+    turned = [replace(each, velocity=-each.velocity, position=-each.position) for each in motions]
+    right, wrong = (np.trace(_solve(bodies, each)[1]) for each in (motions, turned))  # which residuals scale
+    return bool(wrong < _WRONG_SIGN * right)
+
+
 def _tilt(covariance: np.ndarray) -> float:
     """Standard deviation of gravity's direction, radians, of the less certain axis."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]) / STANDARD_GRAVITY)
@@ -177,6 +186,7 @@ class GravitySearch:
         self.poses: list[tuple[float, np.ndarray]] = []
         self._sensor_sigma, self._is_refused = sensor_sigma, False
         self._first: float | None = None
+        self._has_wrong_sign = False
 
     def find(
         self, time: float, pose: np.ndarray, samples: InertialBuffer, T_camera_imu: np.ndarray, densities: np.ndarray
@@ -202,12 +212,13 @@ class GravitySearch:
                 self._complain(time, "samples are missing; all up to an image are to come before it")
                 return None
             bias = bias + align_gyro(bodies, whole)[0]
+        self._has_wrong_sign = self._has_wrong_sign or has_wrong_sign(bodies, whole)
+        problem = "forces have the wrong sign: at rest they point away from the ground" if self._has_wrong_sign else ""
         if not gyro_fits(bodies, whole):
+            problem = "turns are not those of the images; are unit (rad/s), axes, T_cam_imu and clock right?"
+        if problem:
             if not self._is_refused:
-                _LOGGER.warning(
-                    "the inertial sensor is not used: its turns are not those of the images; are unit (rad/s), axes, "
-                    "T_cam_imu and clock right?"
-                )
+                _LOGGER.warning("the inertial sensor is not used: its %s", problem)
             self._is_refused, self.poses = True, []
             return None
         found = align(poses, T_camera_imu, whole, self._sensor_sigma)

@@ -210,6 +210,9 @@ class InertialMotion(MotionFilter):
         if blow is not None:
             _LOGGER.warning("the inertial sensor felt a blow at %.3f s, %.0f m/s^2: do the cameras still fit?", *blow)
             self._covariance[_SENSOR, _SENSOR] += np.diag(SENSOR_SIGMA**2)  # as after a warm-up
+            variance = (blow[1] * np.diff(recent[:, 0]).max()) ** 2 * np.eye(3)  # or a sample went wrong
+            self._covariance[:3, :3] += motion.seconds**2 * variance
+            P += variance
         self.is_resting = motion.missing == 0.0 and self._standstill.holds(recent, self._velocity, P, was_dark)
         if self.is_resting:
             slope, noise = np.zeros((6, _SIZE)), np.zeros((6, 6))

@@ -64,7 +64,7 @@ class OdometryMotion(MotionFilter):
         self._measured: np.ndarray | None = None  # twist of the vehicle up to the last frame
         self._departures: deque[np.ndarray] = deque(maxlen=COMPARED)
         self._compared: deque[np.ndarray] = deque(maxlen=COMPARED)
-        self._seconds, self._densities, self._is_refused = 0.0, np.zeros(2), False
+        self._seconds, self._densities, self._is_refused, self._is_held = 0.0, np.zeros(2), False, False
 
     def set_twist(self, twist: np.ndarray, sigma: np.ndarray) -> None:
         """Of constant velocity alone: wheels measure on where images are lost."""
@@ -102,13 +102,16 @@ class OdometryMotion(MotionFilter):
 
     def correct(self, step: np.ndarray, covariance: np.ndarray) -> None:
         """Takes over the posterior of the pose, which knew the prediction; compares wheels with it."""
-        if self.is_odometric:
-            self._learn(step, covariance)
+        seen = None
+        if self.is_odometric:  # wheels that predict draw the twist along, not the step
+            seen = np.linalg.solve(self._adjoint, self.twist)
+            seen += self._learn(step, covariance) / self._seconds
         super().correct(step, covariance)
-        if self._measured is not None and not self.is_odometric:
-            self._departures.append(np.linalg.solve(self._adjoint, self.twist) - self._measured)
+        if self._measured is not None and not self._is_held:
+            seen = np.linalg.solve(self._adjoint, self.twist) if seen is None else seen
+            self._departures.append(seen - self._measured)
             self._compared.append(self._measured)
-            if len(self._compared) == COMPARED:
+            if len(self._compared) == COMPARED:  # in what began at rest, too: there any unit fits
                 self._begin()
 
     # ---- parts
@@ -124,6 +127,7 @@ class OdometryMotion(MotionFilter):
         start, end = start + self.samples.time_shift, end + self.samples.time_shift
         t = table[:, 0]
         gap, held = np.diff(t).max(initial=0.0), max(t[0] - start, end - t[-1], 0.0)
+        self._is_held = bool(held > gap)
         if gap > _DEAD or held > _DEAD:
             return None, np.zeros(6)
         values = np.hstack([table[:, 4:], table[:, 1:4]]) * self._measures
@@ -136,19 +140,25 @@ class OdometryMotion(MotionFilter):
         return se3_log(T) / (end - start), unsampled
 
     def _begin(self) -> None:
-        """Wheels predict from now on, if their velocities are those of the images."""
+        """Wheels predict from now on, or go on to, if their velocities are those of the images."""
         departures, measured = np.array(self._departures), np.array(self._compared)
         least = _LEAST_SHARE**2 * self._densities
         for part in (slice(0, 3), slice(3, 6)):
             if not self._measures[part].any():
                 continue
-            squared = np.sum(departures[:, part] ** 2, axis=1).mean()
+            # From frame to frame poses are noisy, over many they are not.
+            compared = departures[:, part].mean(axis=0, keepdims=True) if self.is_odometric else departures[:, part]
+            squared = np.sum(compared**2, axis=1).mean()
             allowed = DEPARTURE**2 * np.sum(measured[:, part] ** 2, axis=1).mean()
             if squared > max(allowed, DEPARTURE**2 * self._densities[part].sum()):
-                if not self._is_refused:
+                if self.is_odometric:
+                    self._leave()
+                elif not self._is_refused:
                     _LOGGER.warning("the %s is not used: %s and clock right?", self._name, self._mend)
-                self._is_refused = True
+                    self._is_refused = True
                 return
+        if self.is_odometric:
+            return
         self.spectrum = self._measures * (departures.var(axis=0) * self._seconds + least)
         self.slow, self._last, self.is_odometric = self.spectrum / SLOW**2, np.zeros(6), True
         offset = self.spectrum / (COMPARED * self._seconds)
@@ -161,8 +171,8 @@ class OdometryMotion(MotionFilter):
         self._compared.clear()
         _LOGGER.info("%s predicts: to %.3f m/s and %.4f rad/s", self._name, *np.sqrt(self.spectrum[[0, 5]]))
 
-    def _learn(self, step: np.ndarray, covariance: np.ndarray) -> None:
-        """Noise of each axis, by how far a pose lies from its prediction."""
+    def _learn(self, step: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """Noise of each axis, by how far (6,), which is returned, a pose lies from its prediction."""
         back = np.linalg.inv(se3_adjoint(self.step) @ self._adjoint)
         departure = back @ se3_log(step @ se3_inverse(self.step))
         # By so much the pose's covariance shrank, which is that of the departure, before this one made it wider.
@@ -175,5 +185,9 @@ class OdometryMotion(MotionFilter):
         self.slow = np.clip(self.slow, self.spectrum / _LONGEST**2, self.spectrum / _SHORTEST**2)
         self._last = normalised
         if (self.spectrum > self._densities).any():
-            _LOGGER.warning("the %s departs from the images: constant velocity goes on", self._name)
-            self.is_odometric = False
+            self._leave()
+        return np.asarray(departure)
+
+    def _leave(self) -> None:
+        _LOGGER.warning("the %s departs from the images: constant velocity goes on", self._name)
+        self.is_odometric = False

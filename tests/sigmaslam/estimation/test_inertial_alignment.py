@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sigmaslam.estimation.inertial_alignment import Alignment, _solve, align
+from sigmaslam.estimation.inertial_alignment import Alignment, _solve, align, has_wrong_sign
 from sigmaslam.estimation.preintegration import preintegrate
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import se3_exp
@@ -53,3 +53,21 @@ def test_gravity_is_refused_for_its_length_only_where_noise_does_not_explain_it(
         squared.append(error @ np.linalg.pinv(P, 1e-6) @ error / 2)
         assert align_noisy(seed, 1.0 / 9.81)[0] is None  # in g
     assert np.mean(squared) < 1.5
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.0])
+def test_forces_of_the_wrong_sign_are_told_by_the_path(speed: float):
+    """They give gravity's length as well; at rest nothing tells them."""
+    for seed in range(8):
+        rng, motion = np.random.default_rng(seed), Motion(seed, size=0.3 * speed)
+        exact = motion.measure(np.arange(-0.02, 1.2, 0.005))
+        poses = motion.poses(TIMES)
+        poses[:, :3, 3] += rng.normal(0.0, 2e-4, (len(TIMES), 3))
+        found = []
+        for sign in (1.0, -1.0):
+            samples = InertialSamples(exact.timestamp, exact.gyro, sign * exact.accel)
+            motions = [
+                preintegrate(samples, *span, np.zeros(3), np.zeros(3), SENSOR, np.zeros(2)) for span in pairwise(TIMES)
+            ]
+            found.append(has_wrong_sign(poses, motions))
+        assert found == [False, speed > 0.0]

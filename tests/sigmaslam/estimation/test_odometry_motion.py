@@ -26,8 +26,15 @@ def wheels(motion: Motion, t: np.ndarray) -> np.ndarray:
 
 
 class Drive:
-    def __init__(self, seed: int, noise: float = 0.02, scale: float = 1.0, moves: MotionFilter | None = None) -> None:
-        self.rng, self.motion = np.random.default_rng(seed), Motion(seed, seconds=8.0)
+    def __init__(
+        self,
+        seed: int,
+        noise: float = 0.02,
+        scale: float = 1.0,
+        moves: MotionFilter | None = None,
+        motion: Motion | None = None,
+    ) -> None:
+        self.rng, self.motion = np.random.default_rng(seed), motion or Motion(seed, seconds=8.0)
         self.filter = moves or OdometryMotion("onnx", OdometrySensor(np.eye(4), 0.5, is_planar=False), MOUNTING)
         self.t = np.arange(-0.02, 9.0, PERIOD)
         twists = wheels(self.motion, self.t) * np.r_[np.full(3, scale), np.ones(3)]
@@ -77,6 +84,25 @@ def test_wheels_predict_when_they_are_known_to_agree():
     assert not drive.filter.is_odometric
     drive.drive(1)
     assert drive.filter.is_odometric
+
+
+class Start(Motion):
+    """Rests for 1.5 s."""
+
+    def poses(self, t: np.ndarray) -> np.ndarray:
+        return super().poses(np.maximum(t - 1.5, 0.0))
+
+
+@pytest.mark.parametrize(("scale", "is_right"), [(1.0, True), (1.5, False), (3.6, False), (-1.0, False), (1e3, False)])
+def test_wheels_in_another_unit_that_began_at_rest_are_left_when_they_turn(
+    caplog: pytest.LogCaptureFixture, scale: float, is_right: bool
+):
+    drive = Drive(3, scale=scale, motion=Start(3, seconds=8.0))
+    drive.drive(25)
+    assert drive.filter.is_odometric
+    drive.drive(35)
+    assert drive.filter.is_odometric == is_right
+    assert ("the odometry is not used" in caplog.text) == (not is_right)
 
 
 def test_exact_wheels_are_followed_through_the_dark():
