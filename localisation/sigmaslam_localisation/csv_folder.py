@@ -67,7 +67,7 @@ def read_csv_folder(folder: Path, mapping: bool = False, associated: bool = True
     truth = None
     if (folder / "truth.csv").is_file():
         _, poses = _read(folder / "truth.csv", ["time", "x", "y", "heading"])
-        poses = poses[np.append(True, np.diff(poses[:, 0]) > 0)]
+        poses = poses[np.unique(poses[:, 0], return_index=True)[1]]
         truth = PlanarTruth(poses[:, 0], np.column_stack([poses[:, 1:3], np.unwrap(poses[:, 3])]), LONGEST_GAP)
     return Recording(
         folder.resolve().name,

@@ -40,6 +40,8 @@ def read_recordings(
     """
     if kind == "mrclam":
         robots = find_robots(path)
+        if not robots:
+            raise InputError(f"{path}: has no Robot1_Measurement.dat, or of another number: give --format")
         if robot is not None and robot not in robots:
             raise InputError(f"{path}: has no robot {robot}: choose --robot {', '.join(map(str, robots)) or '(none)'}")
         return [read_mrclam(path, number) for number in ([robot] if robot is not None else robots)]

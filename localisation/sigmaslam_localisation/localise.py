@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sigmaslam.errors import InputError
 from sigmaslam_filters import BayesFilter, ExtendedKalmanFilter, Gaussian, UnscentedKalmanFilter
 from sigmaslam_filters.manifolds import Space
 from sigmaslam_localisation.compiled_robot import run_compiled
@@ -73,8 +74,12 @@ def localise(
         scale: (B, m) variance of the noise at the start, over the nominal one; None: 1.
         tell: called with the share that is done.
         smoothing: keep what smoothers need; not with a `MappingRobot`.
+    Raises:
+        InputError: there is no step.
     """
     K, B, L, m = steps.value.shape
+    if not K:
+        raise InputError("no command and no sighting is later than the start: do truth.csv and they have one clock?")
     path, duration, value, position = (
         torch.from_numpy(column) for column in (steps.path, steps.duration, steps.value, steps.position)
     )

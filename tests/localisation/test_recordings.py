@@ -69,6 +69,16 @@ def test_a_csv_folder_comes_back(tmp_path, kind):
     assert found.kind == kind
 
 
+def test_rows_of_the_truth_may_come_in_any_order(tmp_path):
+    folder = write_csv_folder(tmp_path / "robot", drive(World(seconds=3.0)))
+    before = read_recordings(folder, "csv", None)[0].truth
+    head, *rows = (folder / "truth.csv").read_text().splitlines()
+    (folder / "truth.csv").write_text("\n".join([head, *rows[len(rows) // 2 :], *rows[: len(rows) // 2]]))
+    after = read_recordings(folder, "csv", None)[0].truth
+    np.testing.assert_array_equal(after.seconds, before.seconds)
+    np.testing.assert_array_equal(after.poses, before.poses)
+
+
 def test_without_noise_a_recording_has_no_residuals(tmp_path):
     quiet = drive(World(seconds=3.0))
     for kind in ("range-bearing", "cartesian"):
@@ -133,6 +143,9 @@ def test_of_mrclam_other_robots_and_misread_barcodes_are_left_out(tmp_path):
 def test_a_robot_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="has no robot 2: choose --robot 1"):
         read_recordings(write_mrclam(tmp_path), "mrclam", 2)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match=r"none: has no Robot1_Measurement\.dat"):
+        read_recordings(tmp_path / "none", "mrclam", None)
 
 
 def test_what_is_no_recording_is_refused(tmp_path):
