@@ -83,12 +83,18 @@ class InteractingMultipleModels:
         gate: float | None = None,
         robust: Robust | None = None,
     ) -> Mixture:
-        """Updates each belief, and each motion's probability by the likelihood that it gives the measurement."""
+        """Updates each belief, and each motion's probability by the likelihood that it gives the measurement.
+
+        A motion whose update failed, where failures are held, is as probable as a measurement that nothing explains
+        leaves it, unless all failed: then nothing was learned.
+        """
         updates = [
             self.bayes.update(belief, measurement, value, *inputs, gate=gate, robust=robust)
             for belief in mixture.beliefs
         ]
         likelihood = torch.stack([update.log_likelihood for update in updates], dim=-1)
+        healthy = torch.stack([update.healthy.expand(likelihood.shape[:-1]) for update in updates], dim=-1)
+        likelihood = torch.where(healthy | ~healthy.any(dim=-1, keepdim=True), likelihood, -torch.inf)
         log_joint = torch.log(mixture.probability) + likelihood
         total = torch.logsumexp(log_joint, dim=-1)
         return Mixture([update.belief for update in updates], torch.exp(log_joint - total.unsqueeze(-1)), total)

@@ -85,3 +85,16 @@ def test_a_transition_that_is_none_is_refused():
         filters.InteractingMultipleModels(filters.KalmanFilter(), MOTIONS[:1], TRANSITION)
     with pytest.raises(ValueError, match="rows of the transition must add up to 1"):
         filters.InteractingMultipleModels(filters.KalmanFilter(), MOTIONS, TRANSITION.mT.contiguous())
+
+
+def test_a_motion_whose_update_failed_is_not_the_one_that_holds():
+    """Its log-likelihood of zero is no likelihood; where all failed nothing was learned."""
+    ukf = filters.UnscentedKalmanFilter(on_failure="hold")
+    imm = filters.InteractingMultipleModels(ukf, [MOTIONS[0]] * 2, TRANSITION)
+    near, far = (filters.Gaussian(tensor(x, 0.0), 0.01 * EYE) for x in (4.0, -4.0))
+    root = filters.MeasurementModel(lambda x: torch.sqrt(x[..., :1]), tensor([0.01]))
+    mixture = imm.update(filters.Mixture([near, far], tensor(0.5, 0.5), tensor(0.0).squeeze()), root, tensor(2.5))
+    assert_close(mixture.probability, tensor(1.0, 0.0), 1e-12)
+    assert imm.gaussian(mixture).mean[0] > 4.0
+    mixture = imm.update(filters.Mixture([far, far], tensor(0.3, 0.7), tensor(0.0).squeeze()), root, tensor(2.5))
+    assert_close(mixture.probability, tensor(0.3, 0.7), 1e-12)
