@@ -233,25 +233,15 @@ def render(
     need_extra("train")
     from sigmaslam_synthetic.render_sequence import default_workers, write_sequence, write_sequences
     from sigmaslam_synthetic.simulation import Recipe
+    from sigmaslam_training.devices import choose_device
 
+    choose_device(device)
     numbers = _seeds(seeds) if seeds is not None else range(0)
     if numbers and seed:
         raise InputError(f"--seed {seed} and --seeds {seeds} are both given: leave one out")
-    recipe = Recipe(
-        preset.value,
-        frames,
-        seed,
-        motion.value,
-        movers,
-        sensor.value,
-        disparity_offset,
-        rotation_error,
-        width,
-        height,
-        None if profile is None else str(profile),
-        None if world is None else str(world.resolve()),
-        imu,
-    )
+    camera = motion.value, movers, sensor.value, disparity_offset, rotation_error, width, height
+    files = None if profile is None else str(profile), None if world is None else str(world.resolve())
+    recipe = Recipe(preset.value, frames, seed, *camera, *files, imu)
     workers = workers or default_workers()
     with open_progress() as progress:
         task = progress.add_task("making the world", total=len(numbers) or frames, note="")

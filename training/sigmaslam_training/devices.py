@@ -64,7 +64,7 @@ def open_workplace(device: str = "auto", batch_size: int = 0) -> Iterator[Workpl
     if batch_size % ranks:
         raise InputError(f"a batch of {batch_size} pairs cannot be shared by {ranks} processes: start a divisor of it")
     rank = int(os.environ.get("RANK", "0")) if ranks > 1 else 0
-    chosen = _choose_device(device, int(os.environ.get("LOCAL_RANK", "0")) if ranks > 1 else None)
+    chosen = choose_device(device, int(os.environ.get("LOCAL_RANK", "0")) if ranks > 1 else None)
     if chosen.type == "cuda":
         torch.cuda.set_device(chosen)
     if ranks == 1:
@@ -154,7 +154,12 @@ def to_device(batch: TrainingPair, place: Workplace) -> TrainingPair:
     return image0, image1, keypoints0, places1, visible, keypoints1
 
 
-def _choose_device(name: str, local_rank: int | None) -> torch.device:
+def choose_device(name: str, local_rank: int | None = None) -> torch.device:
+    """The device of a name, auto, cpu, cuda or cuda:1, for one of several processes of this machine.
+
+    Raises:
+        InputError: there is no such device.
+    """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from sigmaslam_synthetic import render_sequence
-from tests.support.commands import run_here
+from tests.support.commands import assert_refused, run_here
 
 
 @pytest.fixture
@@ -55,3 +55,10 @@ def test_seed_and_seeds_exclude_each_other(rendered: list[Any], tmp_path: Path):
     done = run_here("train", "render", "room", "--seed", "3", "--seeds", "1-2", "--out", tmp_path)
     assert done.returncode == 2
     assert "leave one out" in " ".join(done.stderr.split())
+
+
+def test_a_device_that_is_not_there_is_named(tmp_path: Path):
+    for device in ("cuda:99", "tpu"):
+        refused = run_here("train", "render", "organ", "--out", tmp_path / "out", "--frames", "2", "--device", device)
+        assert_refused(refused, device)
+    assert not (tmp_path / "out").exists()
