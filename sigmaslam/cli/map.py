@@ -36,7 +36,7 @@ def reconstruct(
         float | None,
         typer.Option(min=1e-6, help="Largest sigma of a point, metres.", show_default="a twentieth of its distance"),
     ] = None,
-    min_views: Annotated[int, typer.Option(min=1, help="Keyframes that must have given a point.")] = 2,
+    min_views: Annotated[int | None, typer.Option(min=1, help="Views that a point needs.", show_default="2")] = None,
     every: Annotated[int, typer.Option(min=1, help="Use one of so many keyframes.")] = 1,
     export: Annotated[
         Path | None, typer.Option(help="New folder for images, poses and points as nerfstudio and COLMAP read them.")

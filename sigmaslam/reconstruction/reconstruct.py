@@ -114,7 +114,7 @@ def reconstruct_run(
     network: Path | None = None,
     voxel: float | None = None,
     max_sigma: float | None = None,
-    min_views: int = MIN_VIEWS,
+    min_views: int | None = None,
     every: int = 1,
     export: Path | None = None,
 ) -> ReconstructionSummary:
@@ -128,7 +128,7 @@ def reconstruct_run(
         network: ONNX file of a stereo network in place of semi-global matching.
         voxel: side of the finest voxels that points are merged in, metres; None: two pixels at the median depth.
         max_sigma: points with a larger sigma are left out, metres; None: with one of a twentieth of their distance.
-        min_views: keyframes that must have given a point.
+        min_views: as many pixels must have given a point, of other keyframes as a rule; by default two.
         every: of so many keyframes one is used.
         export: folder for images and poses in the forms of nerfstudio and COLMAP.
     Raises:
@@ -168,9 +168,11 @@ def reconstruct_run(
             progress.update(task, advance=1, note=f"{confirmed / max(measured, 1):.0%} confirmed")
     seconds = time.perf_counter() - began
     assert cloud is not None
-    points = cloud.cloud(least_views(keyframes.count, min_views))
+    points = cloud.cloud(least_views(keyframes.count) if min_views is None else min_views)
     if max_sigma is not None:
         points = points.select(points.sigma <= max_sigma)
+    if not len(points.points):
+        raise InputError("no point is left: give a smaller --min-views or a larger --max-sigma")
     write_cloud(out, points)
     if posed is not None:
         posed.write(points)
@@ -294,9 +296,9 @@ def default_voxel(depth: KeyframeDepth, camera: RectifiedStereo) -> float:
     return float(f"{_VOXEL_PIXELS * median / camera.fx:.2g}")
 
 
-def least_views(keyframes: int, wanted: int = MIN_VIEWS) -> int:
+def least_views(keyframes: int) -> int:
     """Keyframes that a point needs where there are so many."""
-    return min(wanted, max(keyframes // 2, 1))
+    return min(MIN_VIEWS, max(keyframes // 2, 1))
 
 
 def _check_writable(path: Path | None) -> None:

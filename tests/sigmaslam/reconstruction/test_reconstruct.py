@@ -25,7 +25,7 @@ from sigmaslam.run_record.dense_points import read_dense_points
 from sigmaslam.run_record.frame_table import read_frames
 from sigmaslam.run_record.recorded_run import read_run
 from sigmaslam.runs.request import LiveOptions
-from tests.support.commands import run_here
+from tests.support.commands import assert_refused, run_here
 from tests.support.demo_parts import copy_frames
 from tests.support.tracked import track
 
@@ -64,6 +64,11 @@ def test_every_second_keyframe_certain_points_and_poses_for_others(tracked: Path
         *("--min-views", "1", "--export", tracked / "posed"),
     )
     assert done.returncode == 0, done.stderr
+    none = run_here(
+        "reconstruct", tracked / "again", "--out", tracked / "none.ply", "--every", "2", "--min-views", "900"
+    )
+    assert_refused(none, "no point is left: give a smaller --min-views")
+    assert not (tracked / "none.ply").exists()
     summary = json.loads((tracked / "again" / "reconstruction.json").read_text())
     assert summary["keyframes"] == -(-keyframes.count // 2)
     assert summary["points"] > 0
