@@ -38,15 +38,5 @@ else:
         return sorted({*globals(), *_MODULES})
 
 
-__all__ = [
-    "Estimate",
-    "LocationFilter",
-    "Matches",
-    "ObjectTracker",
-    "SigmaSlamError",
-    "StereoCamera",
-    "StereoTracker",
-    "TrackerConfig",
-    "match_images",
-    "open_sequence",
-]
+__all__ = ["Estimate", "LocationFilter", "Matches", "ObjectTracker", "SigmaSlamError", "StereoCamera"]
+__all__ += ["StereoTracker", "TrackerConfig", "match_images", "open_sequence"]

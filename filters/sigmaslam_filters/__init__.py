@@ -19,55 +19,11 @@ from sigmaslam_filters.point_estimates import Observation, PointEstimate, maximu
 from sigmaslam_filters.results import TimeUpdate, Update
 from sigmaslam_filters.time_series import Event, Track, interleaved
 
-__all__ = [
-    "SE2",
-    "SE3",
-    "SO2",
-    "SO3",
-    "BayesFilter",
-    "BlockDiagonal",
-    "Dense",
-    "Diagonal",
-    "EnsembleKalmanFilter",
-    "Euclidean",
-    "Event",
-    "ExportError",
-    "ExtendedKalmanFilter",
-    "FilterError",
-    "FittedNoise",
-    "Gaussian",
-    "InteractingMultipleModels",
-    "KalmanFilter",
-    "LinearMeasurement",
-    "LinearMotion",
-    "Manifold",
-    "MeasurementModel",
-    "Mixture",
-    "MotionModel",
-    "Observation",
-    "ParticleFilter",
-    "Particles",
-    "PointEstimate",
-    "Product",
-    "Simplex",
-    "StepExample",
-    "TimeUpdate",
-    "Track",
-    "UnscentedKalmanFilter",
-    "Update",
-    "adapted_noise",
-    "compile_filter",
-    "compile_step",
-    "cubature",
-    "degree_of_belief",
-    "export_step",
-    "fit_noise",
-    "interleaved",
-    "julier",
-    "maximum_a_posteriori",
-    "maximum_likelihood",
-    "merwe",
-    "several",
-    "stack",
-    "wrap_angle",
-]
+__all__ = ["SE2", "SE3", "SO2", "SO3", "BayesFilter", "BlockDiagonal", "Dense", "Diagonal", "EnsembleKalmanFilter"]
+__all__ += ["Euclidean", "Event", "ExportError", "ExtendedKalmanFilter", "FilterError", "FittedNoise", "Gaussian"]
+__all__ += ["InteractingMultipleModels", "KalmanFilter", "LinearMeasurement", "LinearMotion", "Manifold"]
+__all__ += ["MeasurementModel", "Mixture", "MotionModel", "Observation", "ParticleFilter", "Particles"]
+__all__ += ["PointEstimate", "Product", "Simplex", "StepExample", "TimeUpdate", "Track", "UnscentedKalmanFilter"]
+__all__ += ["Update", "adapted_noise", "compile_filter", "compile_step", "cubature", "degree_of_belief"]
+__all__ += ["export_step", "fit_noise", "interleaved", "julier", "maximum_a_posteriori", "maximum_likelihood"]
+__all__ += ["merwe", "several", "stack", "wrap_angle"]

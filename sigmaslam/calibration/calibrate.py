@@ -121,19 +121,9 @@ def calibrate(
     numbers, images = np.unique(corners.image, return_inverse=True)
     covariance, sigma, effect = rig_covariance(bundle)
     single = replace(dropped, image=np.searchsorted(numbers, dropped.image))
-    return BoardCalibration(
-        bundle.rig,
-        covariance,
-        sigma,
-        effect,
-        tuple(names[k] for k in numbers),
-        replace(corners, image=images),
-        bundle.residuals,
-        tuple(outliers),
-        single,
-        single.pixels - project_corners(bundle.rig, bundle.poses, single),
-        bundle,
-    )
+    used = tuple(names[k] for k in numbers), replace(corners, image=images), bundle.residuals, tuple(outliers)
+    alone = single, single.pixels - project_corners(bundle.rig, bundle.poses, single)
+    return BoardCalibration(bundle.rig, covariance, sigma, effect, *used, *alone, bundle)
 
 
 def rig_covariance(bundle: BoardBundle) -> tuple[np.ndarray, float, float]:

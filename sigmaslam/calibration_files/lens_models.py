@@ -14,14 +14,9 @@ from sigmaslam.geometry.checked_yaml import CalibrationYaml
 
 ImageSize = tuple[int, int]
 DISTORTION_MODELS: dict[str, DistortionModel] = {
-    "radial-tangential": "radtan",
-    "radtan": "radtan",
-    "plumb_bob": "radtan",
-    "rational_polynomial": "radtan",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-    "none": "none",
-    "": "none",
+    **dict.fromkeys(("radial-tangential", "radtan", "plumb_bob", "rational_polynomial"), "radtan"),
+    **dict.fromkeys(("equidistant", "fisheye"), "equidistant"),
+    **dict.fromkeys(("none", ""), "none"),
 }
 # What people have and `CameraModel` has not: file name of the model, and its name in words.
 UNSUPPORTED_MODELS = {

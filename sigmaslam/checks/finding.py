@@ -8,24 +8,8 @@ Severity = Literal["ok", "unknown", "warning", "error"]
 
 # A fault comes before its consequences: swapped eyes also have wrong rows.
 _CAUSES_FIRST = (
-    "principal point",
-    "focal length",
-    "exposure",
-    "light",
-    "sharpness",
-    "lines",
-    "overlay",
-    "same image",
-    "mirrored",
-    "overlap",
-    "distortion",
-    "synchronisation",
-    "eyes",
-    "rig",
-    "rows",
-    "rotation",
-    "scale",
-    "infinity",
+    *("principal point", "focal length", "exposure", "light", "sharpness", "lines", "overlay", "same image"),
+    *("mirrored", "overlap", "distortion", "synchronisation", "eyes", "rig", "rows", "rotation", "scale", "infinity"),
 )
 
 

@@ -86,19 +86,9 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
             coefficients[4], sigmas[4] = own[0][4], own[1][4]
             coefficients[:4], sigmas[:4] = _fit(columns[:, :4], rows - coefficients[4] * flow[:, 1], chances)
     shift, roll, zoom, yaw, lag = coefficients.tolist()
-    return RowFit(
-        matches,
-        shift,
-        roll,
-        zoom,
-        yaw,
-        lag if moving else np.nan,
-        sigmas,
-        columns[:, [1, 3]] @ coefficients[[1, 3]],
-        columns[:, 2] * zoom,
-        lag * flow,
-        rows - columns @ coefficients,
-    )
+    by_rotation, residual = columns[:, [1, 3]] @ coefficients[[1, 3]], rows - columns @ coefficients
+    places = by_rotation, columns[:, 2] * zoom, lag * flow, residual
+    return RowFit(matches, shift, roll, zoom, yaw, lag if moving else np.nan, sigmas, *places)
 
 
 def _fit(columns: np.ndarray, values: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

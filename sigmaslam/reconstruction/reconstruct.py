@@ -178,16 +178,9 @@ def reconstruct_run(
         posed.write(points)
     if mesh is not None and volume is not None:
         volume.write(mesh)
-    pixels = keyframes.count * camera.width * camera.height
-    summary = ReconstructionSummary(
-        keyframes.count,
-        len(points),
-        cloud.size,
-        measured / pixels,
-        confirmed / max(measured, 1),
-        float(np.median(points.sigma)) if len(points) else float("nan"),
-        seconds / keyframes.count,
-    )
+    shares = measured / (keyframes.count * camera.width * camera.height), confirmed / max(measured, 1)
+    others = float(np.median(points.sigma)), seconds / keyframes.count
+    summary = ReconstructionSummary(keyframes.count, len(points), cloud.size, *shares, *others)
     _add_to_report(run, points, summary)
     return summary
 

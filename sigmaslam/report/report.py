@@ -33,15 +33,8 @@ MAX_CONFIGURATION = 20_000
 """The report shows at most so many characters of run.json."""
 PICTURE_MAGNIFICATION = 4
 """Ellipses of matches are drawn so many times as large; most are smaller than a pixel of the pictures."""
-_SCRIPTS = (
-    "three-0.170.0.min.js",
-    "uplot-1.6.32.min.js",
-    "scene.js",
-    "plots.js",
-    "frames.js",
-    "timeline.js",
-    "page.js",
-)
+_OWN_SCRIPTS = "scene", "plots", "frames", "timeline", "page"
+_SCRIPTS = "three-0.170.0.min.js", "uplot-1.6.32.min.js", *(f"{each}.js" for each in _OWN_SCRIPTS)
 _STYLES = ("uplot-1.6.32.min.css", "report.css")
 _LINKED = (
     ("trajectory.tum", "poses as they were said"),

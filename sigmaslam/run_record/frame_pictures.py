@@ -178,17 +178,11 @@ class PictureRecorder:
         for k, before in enumerate(self._before):
             _, here, there = np.intersect1d(frame.landmark[rows], before.landmark, return_indices=True)
             trail[here, k] = before.pixels[there]
-        return _Picture(
-            timestamp,
-            score,
-            small_jpeg(frame.left),
-            b"" if frame.agreeing is not None else small_jpeg(frame.right),
-            frame.pixels[rows].astype(np.float32),
-            frame.covariance[rows].astype(np.float32),
-            frame.matches.probability[rows].astype(np.float32),
-            frame.inliers[rows],
-            trail,
+        images = small_jpeg(frame.left), b"" if frame.agreeing is not None else small_jpeg(frame.right)
+        pixels, covariance, probability = (
+            each[rows].astype(np.float32) for each in (frame.pixels, frame.covariance, frame.matches.probability)
         )
+        return _Picture(timestamp, score, *images, pixels, covariance, probability, frame.inliers[rows], trail)
 
 
 def read_pictures(path: Path) -> FramePictures:

@@ -26,22 +26,11 @@ _PREFIX = "keyframe_"
 # Of keyframes V, of which the first K have poses in the joint state S and H hang at these, their features N,
 # descriptors D, the bytes B of all images; the camera has seven numbers.
 _SHAPES: dict[str, tuple[str | int, ...]] = {
-    _PREFIX + "poses": ("V", 4, 4),
-    _PREFIX + "origins": ("V",),
-    _PREFIX + "covariance": ("S", "S"),
-    _PREFIX + "hanging_covariance": ("H", 6, 6),
-    _PREFIX + "timestamps": ("V",),
-    _PREFIX + "image_bytes": ("V",),
-    _PREFIX + "images": ("B",),
-    _PREFIX + "counts": ("V",),
-    _PREFIX + "keypoints": ("N", 2),
-    _PREFIX + "descriptors": ("N", "D"),
-    _PREFIX + "scores": ("N",),
-    _PREFIX + "sigma": ("N",),
-    _PREFIX + "disparity": ("N",),
-    _PREFIX + "disparity_sigma": ("N",),
-    "frontend": (),
-    "intrinsics": (7,),
+    **{_PREFIX + "poses": ("V", 4, 4), _PREFIX + "covariance": ("S", "S"), _PREFIX + "hanging_covariance": ("H", 6, 6)},
+    **{_PREFIX + name: ("V",) for name in ("origins", "timestamps", "image_bytes", "counts")},
+    **{_PREFIX + name: ("N",) for name in ("scores", "sigma", "disparity", "disparity_sigma")},
+    **{_PREFIX + "images": ("B",), _PREFIX + "keypoints": ("N", 2), _PREFIX + "descriptors": ("N", "D")},
+    **{"frontend": (), "intrinsics": (7,)},
 }
 _KINDS = {
     **{_PREFIX + name: "iu" for name in ("origins", "image_bytes", "counts")},

@@ -28,6 +28,7 @@ from sigmaslam.slam.place_recognition import retrieve
 from sigmaslam.slam.point_map import PointMap, hand_over_points, merge_maps
 from sigmaslam.slam.unguided_matching import UnguidedMatcher
 
+# Of M points; one letter is one length.
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     **dict.fromkeys(("observations", "timestamps", "intensity"), ("M",)),
     **{"points": ("M", 3), "covariances": ("M", 3, 3), "pixels": ("M", 2), TURN: (4, 4)},
