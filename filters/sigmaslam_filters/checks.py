@@ -122,6 +122,8 @@ def check_update(
         ValueError: the belief, the value, the noise, the mask or the matrix does not fit.
     """
     require_tensor("the value", value)
+    if not value.ndim:
+        raise ValueError("the value has no dimension: (..., m) is expected, of one component (1,)")
     check_belief(belief, space)
     check_inputs(inputs)
     kind, m = type(measurement).__name__, value.shape[-1]

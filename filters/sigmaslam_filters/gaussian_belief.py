@@ -178,10 +178,14 @@ class Gaussian:
         Args:
             components: those that are known.
             values: (..., c) what they are.
+        Raises:
+            ValueError: there are not as many values as components, or a component stands twice.
         """
         known = self._components(components)
         others = [i for i in range(self.size) if i not in known]
         size = len(known)
+        if values.shape[-1:] != (size,):
+            raise ValueError(f"{size} components are known, the values are {tuple(values.shape)}")
         # The triangular root of the known, then the others: all that is left below is the others' own.
         joint = triangularise([self.factor[..., [*known, *others], :]])
         white = solve_lower(joint[..., :size, :size], (values - self.mean[..., known]).unsqueeze(-1))

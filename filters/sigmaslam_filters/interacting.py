@@ -51,12 +51,18 @@ class InteractingMultipleModels:
             raise ValueError(f"transition is {shape}, but {count} motions need {count} x {count}")
         if not torch.allclose(self.transition.sum(dim=-1), torch.ones_like(self.transition[0]), atol=1e-5):
             raise ValueError(f"rows of the transition must add up to 1, got {self.transition.sum(dim=-1).tolist()}")
+        if (self.transition < 0).any():
+            raise ValueError(f"the transition has a negative probability: {self.transition.tolist()}")
 
     def start(self, belief: Gaussian, probability: Tensor | None = None) -> Mixture:
         """The same belief (...,) for all motions, which are equally probable unless (..., M) is given."""
         count = len(self.motions)
         if probability is None:
             probability = torch.full_like(self.transition[0], 1.0 / count)
+        if probability.shape[-1:] != (count,) or not torch.allclose(
+            probability.sum(dim=-1), torch.tensor(1.0).to(probability)
+        ):
+            raise ValueError(f"{count} probabilities that add up to 1 are needed, got {probability.tolist()}")
         probability = probability.expand(*belief.batch_shape, count)
         return Mixture([belief] * count, probability, torch.zeros_like(probability[..., 0]))
 

@@ -152,6 +152,8 @@ def test_a_belief_is_sampled_marginalised_and_conditioned(by_root):
     batch = filters.Gaussian(random_numbers(3, 4), covariances(3, 4))
     alone = batch[1].conditional([0], tensor(1.0))
     assert_same_belief(batch.conditional([0], tensor(1.0))[1], alone, 1e-14)
+    with pytest.raises(ValueError, match="2 components are known"):
+        batch.conditional([0, 1], tensor(1.0))
     with pytest.raises(ValueError, match="not all different"):
         belief.marginal([1, -3])
     with pytest.raises(ValueError, match="points of a manifold"):
@@ -194,3 +196,9 @@ def test_a_thousand_filters_print_as_one_line():
         assert "\n" not in repr(each)
         assert len(repr(each)) < 500
         assert "1000" in repr(each)
+
+
+def test_a_value_without_a_dimension_is_named():
+    see = filters.LinearMeasurement(tensor([[1.0, 0.0]]), tensor([[0.04]]))
+    with pytest.raises(ValueError, match=r"the value has no dimension: \(\.\.\., m\) is expected"):
+        filters.KalmanFilter().update(beliefs(1, 2)[0], see, torch.tensor(3.0, dtype=torch.float64))

@@ -80,6 +80,16 @@ def test_a_change_of_motion_is_found():
     assert float(found[25:, 1].mean()) < 0.1
 
 
+def test_probabilities_that_are_none_are_refused():
+    ukf = filters.UnscentedKalmanFilter()
+    with pytest.raises(ValueError, match="negative probability"):
+        filters.InteractingMultipleModels(ukf, MOTIONS, torch.tensor([[1.1, -0.1], [0.2, 0.8]], dtype=torch.float64))
+    imm = filters.InteractingMultipleModels(ukf, MOTIONS, TRANSITION)
+    for probability in (tensor(2.0, 2.0), tensor(0.5, 0.3, 0.2)):
+        with pytest.raises(ValueError, match="2 probabilities that add up to 1"):
+            imm.start(beliefs(3, 2, scale=0.05), probability)
+
+
 def test_a_transition_that_is_none_is_refused():
     with pytest.raises(ValueError, match=r"transition is \(2, 2\), but 1 motions need 1 x 1"):
         filters.InteractingMultipleModels(filters.KalmanFilter(), MOTIONS[:1], TRANSITION)
