@@ -191,3 +191,5 @@ class OdometryMotion(MotionFilter):
     def _leave(self) -> None:
         _LOGGER.warning("the %s departs from the images: constant velocity goes on", self._name)
         self.is_odometric = False
+        self._departures.clear()
+        self._compared.clear()

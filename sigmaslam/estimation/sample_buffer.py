@@ -27,6 +27,7 @@ class SampleBuffer:
         self._turn = RLock()
         self._samples: deque[np.ndarray] = deque()
         self._late: deque[np.ndarray] = deque()  # in a row
+        self._has_said = False
         self._table: np.ndarray | None = None  # of the samples, while they stay as they are
 
     def add(self, timestamp: float, turn: np.ndarray, other: np.ndarray) -> None:
@@ -37,9 +38,10 @@ class SampleBuffer:
                 self._samples.append(sample)
                 self._late.clear()
             else:
-                if not self._late:
+                if not self._has_said:
                     _LOGGER.warning("a sample at %.6f s is not later than the last one: left out", timestamp)
-                elif timestamp <= self._late[-1][0]:
+                self._has_said = True
+                if self._late and timestamp <= self._late[-1][0]:
                     self._late.clear()
                 self._late.append(sample)
                 if len(self._late) < _SET_BACK:

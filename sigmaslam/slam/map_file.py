@@ -28,8 +28,8 @@ _PREFIX = "keyframe_"
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     **{_PREFIX + "poses": ("V", 4, 4), _PREFIX + "covariance": ("S", "S"), _PREFIX + "hanging_covariance": ("H", 6, 6)},
     **{_PREFIX + name: ("V",) for name in ("origins", "timestamps", "image_bytes", "counts")},
-    **{_PREFIX + name: ("N",) for name in ("scores", "sigma", "disparity", "disparity_sigma")},
     **{_PREFIX + "images": ("B",), _PREFIX + "keypoints": ("N", 2), _PREFIX + "descriptors": ("N", "D")},
+    **{_PREFIX + name: ("N",) for name in ("scores", "sigma", "disparity", "disparity_sigma")},
     **{"frontend": (), "intrinsics": (7,)},
 }
 _KINDS = {

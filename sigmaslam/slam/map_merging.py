@@ -106,10 +106,8 @@ def merge(one: MapFile, other: MapFile) -> dict[str, np.ndarray]:
     T_one_other = nearest_rigid(T_one_origin @ link.T_key_camera @ se3_inverse(other.pose(found)))
     # Points are in the worlds of the left cameras, keyframes in those of the rectified ones.
     T_left_one = se3_inverse(one.T_rectified_left)
-    step, spread = (
-        T_left_one @ T_one_other @ other.T_rectified_left,
-        turn_covariance(T_left_one @ T_one_origin, covariance),
-    )
+    step = T_left_one @ T_one_other @ other.T_rectified_left
+    spread = turn_covariance(T_left_one @ T_one_origin, covariance)
     merged = merge_maps([one.points, hand_over_points(other.points, step, spread)])
     arrays = {TURN: one.T_rectified_left, **{name: getattr(merged, name) for name in PointMap.__slots__}}
     return arrays | pack_keyframes(one.keyframes, one.past, one.frontend, one.camera, [*one.hanging, *known])

@@ -29,11 +29,12 @@ def test_a_clock_that_is_set_back_counts_from_there(caplog: pytest.LogCaptureFix
         assert [record.message.split(" ")[0] for record in caplog.records] == ["a", "the"]
 
 
-def test_samples_that_are_late_now_and_then_are_left_out():
+def test_samples_that_are_late_now_and_then_are_left_out(caplog: pytest.LogCaptureFixture):
     """Packets that come twice, or out of order."""
     times = 0.005 * np.arange(200)
     buffer = filled(np.r_[times[:100], times[80:95], times[100:150], times[90:80:-1], times[150:]])
     np.testing.assert_array_equal(buffer.around(0.0, 0.992)[:, 0], times)
+    assert len(caplog.records) == 1
 
 
 def test_a_rate_that_leaps_for_one_sample_is_that_of_its_neighbours():
