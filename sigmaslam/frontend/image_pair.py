@@ -172,12 +172,11 @@ def _match_and_doubt(
     image0, image1, features0, features1 = pair
     matches = match_twice(estimator, *pair, min_probability)
     probable = matches.probability >= MIN_PROBABILITY
-    count = int(probable.sum())
-    if count < _BELIEVED:
-        return matches
-    rivals = count_rivals(features0, features1, matches.index0, matches.index1)
-    share = float((rivals[probable] > 0).mean())
-    probability = share_with_rivals(matches.probability, rivals, share)
+    count, probability = int(probable.sum()), matches.probability
+    if count >= _BELIEVED:
+        rivals = count_rivals(features0, features1, matches.index0, matches.index1)
+        share = float((rivals[probable] > 0).mean())
+        probability = share_with_rivals(probability, rivals, share)
     if probability is not matches.probability:
         _LOGGER.warning(
             "the scene repeats itself: %.0f %% of %d matches fit other places as well; their probabilities are shared",
@@ -187,7 +186,7 @@ def _match_and_doubt(
     elif count < _FEW_SHARE * min(len(features0.keypoints), len(features1.keypoints)):
         turned = np.ascontiguousarray(image1[::-1, ::-1])
         others = len(match_twice(estimator, image0, turned, features0, detect(turned)).probability)
-        if others > count:
+        if others > max(count, _BELIEVED):
             probability = matches.probability * np.float32(count / (count + others))
             _LOGGER.warning("upside down, image 1 has %d matches and not %d: turn it by 180 degrees", others, count)
     matches = replace(matches, probability=probability).by_probability()

@@ -77,3 +77,16 @@ def test_a_scene_without_repetition_keeps_its_probabilities(caplog: pytest.LogCa
         found = sigmaslam.match_images(image, noisy(np.roll(image, 12, axis=1), 1), max_keypoints=400)
     assert found.probability.sum() > 100
     assert not caplog.records
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("other", "is_said"), [(3, True), (4, False)])
+def test_an_image_upside_down_of_which_nothing_matches_is_said(
+    caplog: pytest.LogCaptureFixture, other: int, is_said: bool
+):
+    """Of another scene nothing is."""
+    image, seen = (noisy(dead_leaves((240, 320), np.random.default_rng(seed)), seed) for seed in (3, other))
+    with caplog.at_level(logging.WARNING):
+        found = sigmaslam.match_images(image, seen[::-1, ::-1].copy(), max_keypoints=400)
+    assert found.probability.sum() < 8
+    assert ("turn it by 180 degrees" in caplog.text) == is_said
