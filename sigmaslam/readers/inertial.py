@@ -100,10 +100,13 @@ def record(source: Path, seconds: np.ndarray, values: np.ndarray, sensor: Inerti
 
 
 def in_order(source: Path, seconds: np.ndarray) -> np.ndarray:
-    """(N,) bool, which samples are later than all before them; InputError where there are too few."""
+    """(N,) bool, which samples increase, by those before or by those behind; InputError where there are too few."""
     if len(seconds) < 2:
         raise InputError(f"{source}: has {len(seconds)} samples; give the sensor's table")
     later = np.r_[True, seconds[1:] > np.maximum.accumulate(seconds)[:-1]]
+    # One of the future makes all that follow early.
+    earlier = np.r_[seconds[:-1] < np.minimum.accumulate(seconds[::-1])[-2::-1], True]
+    later = max(later, earlier, key=np.count_nonzero)
     dropped = int((~later).sum())
     if dropped > _MOST_OUT_OF_ORDER * len(seconds):
         raise InputError(f"{source}: {dropped} of {len(seconds)} time stamps do not increase: sort the samples by time")

@@ -5,7 +5,7 @@ import pytest
 
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse
-from sigmaslam.readers.inertial import find_imu, read_imu
+from sigmaslam.readers.inertial import find_imu, in_order, read_imu
 
 NOISE = """gyroscope_noise_density: 1.6968e-04
 gyroscope_random_walk: 1.9393e-05
@@ -41,6 +41,13 @@ def test_euroc_s_table_and_sensors_are_read(asl):
     np.testing.assert_allclose(np.diff(recording.samples.timestamp), 0.005, atol=1e-6)
     np.testing.assert_array_equal(recording.samples.gyro[3], [0.1, 0.2, 3])
     np.testing.assert_array_equal(recording.samples.accel[3], [9.8, 0, -1.5])
+
+
+@pytest.mark.parametrize("stamp", [1e4, -5.0])
+def test_one_stamp_of_another_time_costs_one_sample(stamp: float):
+    seconds = 0.005 * np.arange(1000)
+    seconds[300] = stamp
+    np.testing.assert_array_equal(np.flatnonzero(~in_order(Path("imu.csv"), seconds)), [300])
 
 
 def test_kalibr_s_files_beside_a_table_of_seconds_are_read(tmp_path):
