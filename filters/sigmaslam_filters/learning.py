@@ -55,8 +55,10 @@ def fit_noise(
         bayes: a filter in R^n; None: unscented.
     Raises:
         TypeError: the filter is on a manifold.
-        ValueError: a noise is not additive, or the motion has a noise matrix.
+        ValueError: a noise is not additive, the motion has a noise matrix, or there is nothing to fit.
     """
+    if steps < 1 or len(values) < 2 or torch.isnan(values).all():
+        raise ValueError("noise is fitted to two measurements or more, of which one is there, in a step or more")
     if motion.noise_matrix is not None or not (is_additive(motion) and is_additive(measurement)):
         raise ValueError("noise is fitted to models that add it, without noise_matrix")
     bayes = UnscentedKalmanFilter() if bayes is None else bayes

@@ -182,4 +182,9 @@ def _differences(
     residual = None if isinstance(measurement, LinearMeasurement) else measurement.residual
     seen, filled = measurement.evaluate(states, *inputs), torch.where(present, value, 0.0)
     difference = filled - seen if residual is None else residual(filled, seen)
-    return torch.where(present, difference, 0.0), as_noise(measurement.noise).masked(present), present
+    noise = as_noise(measurement.noise)
+    variance = noise.variance()
+    if value.shape[-1:] != variance.shape[-1:] or torch.isinf(value).any() or (variance < 0.0).any():
+        shown = f"{value.tolist()} by variances {variance.tolist()}"
+        raise ValueError(f"a measurement is finite, and has as many components as variances, none negative: {shown}")
+    return torch.where(present, difference, 0.0), noise.masked(present), present

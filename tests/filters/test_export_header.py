@@ -87,7 +87,7 @@ def test_a_program_with_the_header_follows_a_robot_as_torch_does(make, dtype, tm
     assert [row[-2] for row in expected] == [4, 4, 3, 0, 4, 4]
 
 
-@pytest.mark.parametrize("name", ["two-words.hpp", "double.hpp", "1st.hpp"])
+@pytest.mark.parametrize("name", ["two-words.hpp", "double.hpp", "1st.hpp", "union.hpp", "NAN.hpp"])
 def test_a_name_that_is_none_in_cpp_is_refused(name, tmp_path):
     see = filters.LinearMeasurement(torch.eye(2).double(), torch.eye(2).double())
     example = filters.StepExample(

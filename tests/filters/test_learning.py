@@ -127,3 +127,6 @@ def test_sequences_that_cannot_be_fitted_are_refused():
         filters.fit_noise(PRIOR, motion, see, values, bayes=filters.UnscentedKalmanFilter(filters.SE2()))
     with pytest.raises(ValueError, match="without noise_matrix"):
         filters.fit_noise(PRIOR, filters.LinearMotion(A, Q, noise_matrix=EYE), see, values)
+    for given, steps in ((values[:1], 2), (torch.full_like(values, torch.nan), 2), (values, 0)):
+        with pytest.raises(ValueError, match="noise is fitted to two measurements or more"):
+            filters.fit_noise(PRIOR, motion, see, given, steps)

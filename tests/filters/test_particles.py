@@ -127,3 +127,12 @@ def test_rao_blackwellised_particles_sample_a_part_and_filter_the_rest():
             errors[k, 1] += (said - update.log_likelihood).square().mean()
     assert bool((errors[0] < 0.25 * errors[1]).all())
     assert float(errors[0, 0]) / 15 < 0.1**2
+
+
+@pytest.mark.parametrize("make", [filters.ParticleFilter, filters.EnsembleKalmanFilter])
+@pytest.mark.parametrize(("value", "variance"), [([0.1, 0.3], 0.04), ([torch.inf], 0.04), ([0.1], -0.04)])
+def test_measurements_that_cannot_be_are_refused(make, value, variance):
+    see = filters.LinearMeasurement(tensor(1.0, 0.0)[None], filters.Diagonal(tensor(variance)))
+    cloud = make(torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match="a measurement is finite, and has as many components as variances"):
+        cloud.update(cloud.sample(beliefs(1, 2), 100), see, tensor(*value))

@@ -19,9 +19,11 @@ from sigmaslam_filters.models import AnyMeasurement, AnyMotion
 from sigmaslam_filters.robust import Robust
 
 Run = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
-# Names of the header, and the words of C++ that users are likely to take.
+# Names of the header, and the words of C++ and names of <cmath> that are no words of Python.
 _TAKEN = """mean covariance root update predict result healthy Number Update sign modulo std int double float char short
-long bool auto const this new switch case default static struct"""
+long bool auto const this new switch case default static struct union register signed unsigned operator delete volatile
+extern goto template typename virtual friend inline mutable namespace private protected public explicit enum do typedef
+using void throw catch sizeof NAN INFINITY HUGE_VAL M_PI M_E"""
 
 
 def write_header(
