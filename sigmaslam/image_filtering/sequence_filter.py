@@ -18,6 +18,8 @@ _WINDOWS = (5, 11)
 _GATE = 1.5
 # Frames that are filtered backwards at once, and later ones from which that begins: a state has settled after four.
 _AT_ONCE, _LATER = 8, 4
+# An image that varies by fewer grey levels shows a lens cap, or nothing, and says little of the noise.
+_BLANK = 4.0
 # Variance of what nothing is known of, grey levels squared.
 _UNKNOWN = np.float32(1e6)
 
@@ -31,7 +33,7 @@ class SequenceFilter:
     variance tells, the patches of the image take out; the state keeps it, so that no blur piles up.
 
     Args:
-        noise: of the images; None to estimate it from the first one.
+        noise: of the images; None to estimate it from the first one that shows something.
 
     Attributes:
         prior: mean and variance (H, W) of the state before the last frame was taken in.
@@ -40,7 +42,7 @@ class SequenceFilter:
     prior: tuple[np.ndarray, np.ndarray]
 
     def __init__(self, noise: NoiseModel | None = None) -> None:
-        self.noise = noise
+        self.noise, self._is_blank = noise, False  # the image that it is of
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._mean: np.ndarray | None = None
         self._variance: np.ndarray | None = None
@@ -69,8 +71,8 @@ class SequenceFilter:
         """
         if self._mean is not None and image.shape != self._mean.shape:
             raise ValueError(f"the image is {image.shape[::-1]}, those before {self._mean.shape[::-1]} (width, height)")
-        if self.noise is None:
-            self.noise = estimate_noise(image)
+        if self.noise is None or self._is_blank:
+            self.noise, self._is_blank = estimate_noise(image), float(image.std()) < _BLANK
         stuck = stuck_pixels(image, self.noise)
         measured = image.astype(np.float32)
         if stuck.any():

@@ -34,6 +34,19 @@ def test_the_first_frame_is_its_own_state(scene: np.ndarray):
     np.testing.assert_allclose(variance, SIGMA**2, rtol=1e-4)
 
 
+@pytest.mark.parametrize("grey", [0.0, 120.0, 255.0])
+def test_noise_is_that_of_the_first_image_that_shows_something(scene: np.ndarray, grey: float):
+    """Not of a lens cap, or of a fade-in's white."""
+    rng, follow = np.random.default_rng(0), SequenceFilter()
+    for _ in range(2):
+        follow.step(np.clip(np.rint(grey + rng.normal(0.0, 0.5, scene.shape)), 0, 255).astype(np.uint8))
+    for _ in range(2):
+        shown = follow.step(np.clip(np.rint(noisy(scene, rng)), 0, 255).astype(np.uint8))
+        assert follow.noise is not None
+        assert follow.noise.sigma == pytest.approx(SIGMA, rel=0.15)
+    assert error(shown, scene) < 0.5 * SIGMA
+
+
 def test_a_scene_at_rest_grows_surer_and_the_variance_says_how_sure(scene: np.ndarray):
     rng, follow, errors = np.random.default_rng(0), SequenceFilter(NoiseModel(SIGMA)), []
     for _ in range(8):
