@@ -59,9 +59,8 @@ class InteractingMultipleModels:
         count = len(self.motions)
         if probability is None:
             probability = torch.full_like(self.transition[0], 1.0 / count)
-        if probability.shape[-1:] != (count,) or not torch.allclose(
-            probability.sum(dim=-1), torch.tensor(1.0).to(probability)
-        ):
+        total = probability.sum(dim=-1)
+        if probability.shape[-1:] != (count,) or not torch.allclose(total, torch.ones_like(total)):
             raise ValueError(f"{count} probabilities that add up to 1 are needed, got {probability.tolist()}")
         probability = probability.expand(*belief.batch_shape, count)
         return Mixture([belief] * count, probability, torch.zeros_like(probability[..., 0]))
