@@ -43,7 +43,7 @@ def read_recordings(
         if not robots:
             raise InputError(f"{path}: has no Robot1_Measurement.dat, or of another number: give --format")
         if robot is not None and robot not in robots:
-            raise InputError(f"{path}: has no robot {robot}: choose --robot {', '.join(map(str, robots)) or '(none)'}")
+            raise InputError(f"{path}: has no robot {robot}: choose --robot {', '.join(map(str, robots))}")
         return [read_mrclam(path, number) for number in ([robot] if robot is not None else robots)]
     if robot is not None:
         raise InputError(f"{path}: a recording of this format has one robot: leave out --robot")
