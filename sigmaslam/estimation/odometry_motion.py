@@ -104,15 +104,19 @@ class OdometryMotion(MotionFilter):
         """Takes over the posterior of the pose, which knew the prediction; compares wheels with it."""
         seen = None
         if self.is_odometric:  # wheels that predict draw the twist along, not the step
-            seen = np.linalg.solve(self._adjoint, self.twist)
-            seen += self._learn(step, covariance) / self._seconds
+            seen = np.linalg.solve(self._adjoint, self.twist) + self._learn(step, covariance) / self._seconds
         super().correct(step, covariance)
         if self._measured is not None and not self._is_held:
             seen = np.linalg.solve(self._adjoint, self.twist) if seen is None else seen
             self._departures.append(seen - self._measured)
             self._compared.append(self._measured)
             if len(self._compared) == COMPARED:  # in what began at rest, too: there any unit fits
-                self._begin()
+                agrees = self._agrees()
+                if agrees != self.is_odometric:
+                    (self._begin if agrees else self._leave)()
+                elif not agrees and not self._is_refused:
+                    _LOGGER.warning("the %s is not used: %s and clock right?", self._name, self._mend)
+                    self._is_refused = True
 
     # ---- parts
 
@@ -139,26 +143,23 @@ class OdometryMotion(MotionFilter):
             T = T @ part
         return se3_log(T) / (end - start), unsampled
 
-    def _begin(self) -> None:
-        """Wheels predict from now on, or go on to, if their velocities are those of the images."""
+    def _agrees(self) -> bool:
+        """Whether the last velocities of the wheels are those of the images, in the mean where they predict."""
         departures, measured = np.array(self._departures), np.array(self._compared)
-        least = _LEAST_SHARE**2 * self._densities
+        if self.is_odometric:  # single frames are noisy
+            departures = departures.mean(axis=0, keepdims=True)
         for part in (slice(0, 3), slice(3, 6)):
-            if not self._measures[part].any():
-                continue
-            # From frame to frame poses are noisy, over many they are not.
-            compared = departures[:, part].mean(axis=0, keepdims=True) if self.is_odometric else departures[:, part]
-            squared = np.sum(compared**2, axis=1).mean()
-            allowed = DEPARTURE**2 * np.sum(measured[:, part] ** 2, axis=1).mean()
-            if squared > max(allowed, DEPARTURE**2 * self._densities[part].sum()):
-                if self.is_odometric:
-                    self._leave()
-                elif not self._is_refused:
-                    _LOGGER.warning("the %s is not used: %s and clock right?", self._name, self._mend)
-                    self._is_refused = True
-                return
-        if self.is_odometric:
-            return
+            squared, allowed = (
+                np.sum(each[:, part] ** 2, axis=1).mean() for each in (departures, DEPARTURE * measured)
+            )
+            least = DEPARTURE**2 * self._densities[part].sum()
+            if self._measures[part].any() and squared > max(allowed, least):
+                return False
+        return True
+
+    def _begin(self) -> None:
+        """Wheels predict from now on."""
+        departures, least = np.array(self._departures), _LEAST_SHARE**2 * self._densities
         self.spectrum = self._measures * (departures.var(axis=0) * self._seconds + least)
         self.slow, self._last, self.is_odometric = self.spectrum / SLOW**2, np.zeros(6), True
         offset = self.spectrum / (COMPARED * self._seconds)
