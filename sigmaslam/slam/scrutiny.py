@@ -53,6 +53,8 @@ class Scrutiny:
         self._T_rival_fit = self._parting = np.eye(4)
         self._rival_covariance = np.zeros((6, 6))
         self._last_error, self._had_other_times = 0.0, False
+        # Frames since the camera stopped within one, if it did, and the covariance of the pose expected there.
+        self._stands, self._stopped_for, self._expected = False, 0, np.zeros((6, 6))
         self._input_is_wrong = input_is_wrong
         self.timing = EyeTiming(self._window.camera.baseline)
         self._before: tuple[np.ndarray, ...] | None = None
@@ -141,13 +143,14 @@ class Scrutiny:
         image, pose, old_ids, old_seen = self._before or (left, fit.pose, ids, seen)
         ways = seen_apart(self._window, rows, pose, fit.pose)
         moves = ways > 3.0 * ACCEPTANCE.stands
+        self._stands = 2 * (ways > ACCEPTANCE.stands).sum() < len(ways)
         if self._before is None or 2 * moves.sum() >= np.isfinite(ways).sum():
             _, now, then = np.intersect1d(ids, old_ids, assume_unique=True, return_indices=True)
             stays = moves[now] & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
             is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves[now].sum()
             self._fixed_for = SPOILT if is_fixed else max(self._fixed_for - 1, 0)
             self._before = left, fit.pose, ids, seen
-        elif 2 * (ways > ACCEPTANCE.stands).sum() < len(ways) and shows_motion(image, left):
+        elif self._stands and shows_motion(image, left):
             return True
         return self._fixed_for > 0
 
@@ -166,6 +169,7 @@ class Scrutiny:
         excess = surprise(self._motion, fit.step)
         if is_other:
             self._motion.doubt_time(error * self._clock.interval)
+            self._expected, self._stopped_for = Prediction.of(self._window, self._motion).covariance, int(error < 0.0)
         elif excess > 1.0:
             self._motion.widen(excess)
         doubts.prediction_is_wrong = is_other or excess > 1.0
@@ -174,6 +178,12 @@ class Scrutiny:
             doubts.add(Doubt.TIME)
             # The pose at the stamp is the prediction, as uncertain as it was before, and the image's is off by a way.
             doubts.spread = doubts.spread + Prediction.of(self._window, self._motion).covariance
+        # An image that is delivered again, compressed anew, looks like a stop within a frame; so do those after it.
+        self._stopped_for += not is_other and self._stopped_for > 0
+        self._stopped_for *= self._stands
+        if self._stopped_for > 1:
+            doubts.add(Doubt.TIME)
+            doubts.spread = doubts.spread + self._stopped_for**2 * self._expected
         self._last_error = error
 
 

@@ -127,6 +127,17 @@ def freeze(count: int, frames: Frames, rng: np.random.Generator) -> Frames:
     return _show(frames, _frozen(len(frames), start_of(frames), count))
 
 
+def freeze_anew(count: int, frames: Frames, rng: np.random.Generator) -> Frames:
+    """The same, each time compressed by another quality, as a stream that goes on without its camera."""
+    still, first = freeze(count, frames, rng), start_of(frames)
+    for k in range(first, min(first + count, len(frames))):
+        quality = int(rng.integers(60, 90))
+        still[k] = replace(
+            still[k], left=_compressed(still[k].left, quality), right=_compressed(still[k].right, quality)
+        )
+    return still
+
+
 def freeze_right(count: int, frames: Frames, rng: np.random.Generator) -> Frames:
     """The same right image for some frames."""
     return _show(frames, np.arange(len(frames)), _frozen(len(frames), start_of(frames), count))
@@ -309,6 +320,10 @@ def _once_in_ten(frames: Frames, change: Callable[[int], DrivenFrame]) -> Frames
     return [change(number) if number % 10 == 5 else frame for number, frame in enumerate(frames)]
 
 
+def _compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], 0))
+
+
 def _frozen(frames: int, first: int, count: int) -> np.ndarray:
     number = np.arange(frames)
     return np.where((number >= first) & (number < first + count), first - 1, number)
@@ -348,6 +363,7 @@ FAULTS: dict[str, Fault] = {
     "step_back": Fault("clock set back by 5 intervals", partial(step_clock, -5.0)),
     "frozen_5": Fault("the same pair for 5 frames", partial(freeze, 5)),
     "frozen_10": Fault("the same pair for 10 frames", partial(freeze, 10)),
+    "frozen_anew": Fault("the same pair for 10 frames, compressed anew", partial(freeze_anew, 10)),
     "frozen_right": Fault("the same right image for 5 frames", partial(freeze_right, 5)),
     "drop_20": Fault("a fifth of the frames is missing", partial(drop, 0.2)),
     "uncounted": Fault("a tenth is missing, stamps are of a counter without them", partial(drop_uncounted, 0.1)),

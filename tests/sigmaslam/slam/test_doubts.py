@@ -59,6 +59,7 @@ def silent_wrong(estimates: list[Estimate], truth: np.ndarray) -> list[int]:
     [
         ("out_of_order", Doubt.TIME),
         ("uncounted", Doubt.TIME),
+        ("frozen_anew", Doubt.TIME),
         ("columns_2", Doubt.RIG),
         ("rows_3", Doubt.RIG),
         ("yaw", Doubt.RIG),
