@@ -1,9 +1,10 @@
-"""A module as an ONNX graph: written, and compared with torch on inputs of other sizes than it was traced with."""
+"""A module as an ONNX graph: written, kept by its hash, and compared with torch on inputs of other sizes."""
 
 import contextlib
+import hashlib
 import logging
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
-from sigmaslam.files import atomic_path
+from sigmaslam.files import atomic_path, atomic_write_json
 from sigmaslam.inference.onnx_graph import OnnxGraph
+from sigmaslam.inference.weight_manifest import MANIFEST_NAME, read_manifest
 from sigmaslam_filters.graphs.graph_file import simplify, strip_origins
 from sigmaslam_models.runtime_operators import inverse_operator
 
@@ -146,3 +148,15 @@ def relative_difference(actual: list[np.ndarray], expected: list[np.ndarray]) ->
     """Largest difference over all outputs, relative to an output's largest value where that exceeds 1."""
     pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(actual, expected, strict=True)]
     return max(float(np.abs(a - b).max() / max(1.0, float(np.abs(b).max()))) for a, b in pairs)
+
+
+def update_manifest(folder: Path, names: Iterable[str]) -> None:
+    """Writes the hashes of these files of a folder into its manifest; other entries stay.
+
+    Raises:
+        InputError: the manifest that is there cannot be read, or the folder cannot be written.
+    """
+    path = folder / MANIFEST_NAME
+    hashes = read_manifest(path) if path.is_file() else {}
+    hashes |= {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    atomic_write_json(path, dict(sorted(hashes.items())))

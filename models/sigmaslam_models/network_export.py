@@ -15,10 +15,10 @@ from torch import Tensor, nn
 from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_bytes, atomic_write_json, atomic_write_text, make_folder
 from sigmaslam.inference.onnx_graph import shipped_weights
-from sigmaslam.inference.weight_manifest import check_weights, update_manifest
+from sigmaslam.inference.weight_manifest import check_weights
 from sigmaslam_models.extractor import BLOBS, EXTRACTOR_SIZE_MULTIPLE, FeatureExtractor
 from sigmaslam_models.feature_network import FeatureNetwork
-from sigmaslam_models.graph_export import TracedModule, exchange_weights, export_graph
+from sigmaslam_models.graph_export import TracedModule, exchange_weights, export_graph, update_manifest
 from sigmaslam_models.model_card import read_card, scoring_page
 from sigmaslam_models.scorer_network import NEIGHBOURS, SIDE_CHANNELS, MatchScorer, ScoredMatches
 from sigmaslam_models.verifier_network import PLACE_COLUMNS, VERIFIER_COLUMNS, MatchCovariance, MatchVerifier

@@ -4,9 +4,8 @@ from pathlib import Path
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam.files import atomic_write_bytes, atomic_write_json, atomic_write_text, make_folder
-from sigmaslam.inference.weight_manifest import update_manifest
 from sigmaslam_models.estimator.estimator_export import ESTIMATOR_TOLERANCE, estimator_graphs
-from sigmaslam_models.graph_export import graph_difference, relative_difference
+from sigmaslam_models.graph_export import graph_difference, relative_difference, update_manifest
 from sigmaslam_models.model_card import card_page, read_card
 from sigmaslam_models.network_export import NETWORK_TOLERANCE, export_features, feature_difference, network_graphs
 

@@ -1,12 +1,10 @@
 """manifest.json beside weights and graphs: their SHA-256, as they were exported."""
 
 import hashlib
-from collections.abc import Iterable
 from pathlib import Path
 
 from sigmaslam.bounded_files import read_json, shorten
 from sigmaslam.errors import InputError
-from sigmaslam.files import atomic_write_json
 
 MANIFEST_NAME = "manifest.json"
 _MANIFEST_BYTES = 1 << 20
@@ -41,15 +39,3 @@ def read_manifest(path: Path) -> dict[str, str]:
     if not isinstance(content, dict) or not all(isinstance(each, str) for each in content.values()):
         raise InputError(f"{path}: is no table of file names and SHA-256: {_MEND}")
     return content
-
-
-def update_manifest(folder: Path, names: Iterable[str]) -> None:
-    """Writes the hashes of these files of a folder into its manifest; other entries stay.
-
-    Raises:
-        InputError: the manifest that is there cannot be read, or the folder cannot be written.
-    """
-    path = folder / MANIFEST_NAME
-    hashes = read_manifest(path) if path.is_file() else {}
-    hashes |= {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
-    atomic_write_json(path, dict(sorted(hashes.items())))

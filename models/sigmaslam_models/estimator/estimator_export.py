@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from sigmaslam.inference.weight_manifest import update_manifest
 from sigmaslam_filters.manifolds.se3_matrices import exp_se3
 from sigmaslam_models.estimator.frame_update import FrameViews, GatedStep, PredictViews, RobustStep
 from sigmaslam_models.estimator.graph_examples import (
@@ -28,7 +27,7 @@ from sigmaslam_models.estimator.inertial_prediction import STATE_SIZE as INERTIA
 from sigmaslam_models.estimator.inertial_prediction import InertialPredict
 from sigmaslam_models.estimator.pose_prediction import STATE_SIZE, Predict
 from sigmaslam_models.estimator.window_solution import Condition, EliminateLandmarks, GateWindow, WindowViews
-from sigmaslam_models.graph_export import TracedModule, export_graph
+from sigmaslam_models.graph_export import TracedModule, export_graph, update_manifest
 
 # ONNX Runtime and torch may order sums differently; more than this is a wrong graph.
 ESTIMATOR_TOLERANCE = 1e-9

@@ -19,9 +19,10 @@ from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.frontend.match_confidence import ConfidenceEstimator
 from sigmaslam.inference.networks import NETWORKS, network_path, networks_in, open_graph
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
-from sigmaslam.inference.weight_manifest import MANIFEST_NAME, update_manifest
+from sigmaslam.inference.weight_manifest import MANIFEST_NAME
 from sigmaslam.readers import open_sequence
 from sigmaslam_benchmarks.tracking.features import write_features
+from sigmaslam_models.graph_export import update_manifest
 from sigmaslam_synthetic.rendering.textures import dead_leaves
 from tests.support.commands import assert_refused, run_here
 

@@ -9,7 +9,8 @@ import pytest
 from sigmaslam.errors import InputError
 from sigmaslam.frontend.learned import LearnedDetector
 from sigmaslam.inference.onnx_graph import OnnxGraph, shipped_weights
-from sigmaslam.inference.weight_manifest import MANIFEST_NAME, check_weights, read_manifest, update_manifest
+from sigmaslam.inference.weight_manifest import MANIFEST_NAME, check_weights, read_manifest
+from sigmaslam_models.graph_export import update_manifest
 
 GRAPH = "place_verifier.onnx"
 
