@@ -133,6 +133,12 @@ def write_ply(path: str | Path, columns: dict[str, tuple[str, np.ndarray]]) -> N
     atomic_write_bytes(path, header.encode("ascii") + vertices.tobytes())
 
 
+def save_png(figure: Any, path: str | Path) -> None:
+    """A matplotlib figure as PNG."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130)
+
+
 def atomic_write_bytes(path: str | Path, content: bytes) -> None:
     """Write `content`; see `atomic_path`."""
     with atomic_path(path) as temporary:

@@ -10,11 +10,11 @@ import numpy as np
 
 from sigmaslam.bounded_files import TABLE_BYTES, read_text
 from sigmaslam.errors import InputError
+from sigmaslam.files import save_png
 from sigmaslam.geometry.se3 import se3_inverse
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.plot_style import has_matplotlib
 from sigmaslam.readers.trajectory_files import kitti_times_path, read_covariances, read_trajectory, trajectory_format
-from sigmaslam.report.figures import save_png
 from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, predicted_poses, read_frames
 from sigmaslam.run_record.relative_pose_file import RELATIVE_POSES_NAME, read_frame_pairs
 from sigmaslam.run_record.run_folder import FINAL_COVARIANCE, FINAL_TRAJECTORY, check_has_trajectory

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from sigmaslam.errors import InputError
+from sigmaslam.files import save_png
 from sigmaslam.plot_style import BLUE, GREY, has_matplotlib
-from sigmaslam.report.figures import save_png
 from sigmaslam_filters import SO3, Gaussian, degree_of_belief
 from sigmaslam_localisation.localisation_page import draw_axes
 from sigmaslam_localisation.localise import FilterName, Localisation, localise, make_filter

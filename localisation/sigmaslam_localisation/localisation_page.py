@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from sigmaslam.files import atomic_write_text, printable
+from sigmaslam.files import atomic_write_text, printable, save_png
 from sigmaslam.plot_style import BLUE, GREEN, GREY, NO_MATPLOTLIB, SERIES, has_matplotlib, style_axes
-from sigmaslam.report.figures import save_png
 from sigmaslam.report.page_parts import load_template
 from sigmaslam_localisation.robots import RobotEstimate
 

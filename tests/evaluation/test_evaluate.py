@@ -181,7 +181,7 @@ def test_a_picture_that_cannot_be_written_costs_a_warning_alone(drive, monkeypat
     def full(path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("sigmaslam.report.figures.atomic_path", full)
+    monkeypatch.setattr("sigmaslam.files.atomic_path", full)
     evaluation = evaluate_run(*drive)
     assert evaluation.figure_path is None
     assert evaluation.matched == 186

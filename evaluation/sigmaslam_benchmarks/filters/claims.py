@@ -15,8 +15,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2, t
 from torch import Generator, Tensor
 
+from sigmaslam.files import save_png
 from sigmaslam.plot_style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, style_axes
-from sigmaslam.report.figures import save_png
 from sigmaslam_benchmarks.filters import scenarios
 from sigmaslam_benchmarks.filters.scenarios import Outcome, Scenario, run
 from sigmaslam_benchmarks.tracking.page import fill_page, write_page

@@ -15,9 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sigmaslam.errors import InputError
+from sigmaslam.files import save_png
 from sigmaslam.plot_style import BLACK, GREY, SERIES, style_axes
 from sigmaslam.readers import open_sequence
-from sigmaslam.report.figures import save_png
 from sigmaslam_benchmarks.matching.photographs import read_grey
 from sigmaslam_benchmarks.tracking import image_statistics as statistics
 from sigmaslam_benchmarks.tracking import render_odometry as odometry
