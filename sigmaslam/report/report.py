@@ -10,17 +10,8 @@ import numpy as np
 from markupsafe import Markup
 
 from sigmaslam.files import atomic_write_text, printable
+from sigmaslam.report import report_facts
 from sigmaslam.report.page_parts import data_url, load_template, read_asset
-from sigmaslam.report.report_facts import (
-    judge,
-    list_calibration,
-    list_evaluation,
-    list_facts,
-    list_inertial,
-    list_machine,
-    list_refinement,
-    list_statuses,
-)
 from sigmaslam.report.report_plots import MAX_FRAMES, build_plots, thin
 from sigmaslam.report.report_scene import build_scene
 from sigmaslam.run_record.frame_pictures import FramePictures
@@ -67,7 +58,7 @@ def write_report(run_dir: str | Path) -> Path:
     folder = Path(run_dir)
     run = read_run(folder)
     scene, pictures = build_scene(run), _pictures(run)
-    state, (head, rows) = judge(run), list_evaluation(run)
+    state, (head, rows) = report_facts.judge(run), report_facts.list_evaluation(run)
     page = {
         "intervals": _intervals(run.frames),
         "statuses": STATUSES,
@@ -85,20 +76,20 @@ def write_report(run_dir: str | Path) -> Path:
         name=printable(folder.resolve().name),
         kind=state.kind,
         state=state,
-        facts=list_facts(run),
-        statuses=list_statuses(run),
+        facts=report_facts.list_facts(run),
+        statuses=report_facts.list_statuses(run),
         contradiction=contradiction_verdict(run.summary),
         verdict=run.summary.get("calibration_verdict"),
-        calibration=list_calibration(run),
-        inertial=list_inertial(run),
+        calibration=report_facts.list_calibration(run),
+        inertial=report_facts.list_inertial(run),
         pictures=pictures,
         evaluation_head=head,
         evaluation_rows=rows,
         truth_hint=run.evaluation.get("truth_hint"),
         truth_notes=run.evaluation.get("truth_notes", ()),
         nees_verdict=run.evaluation.get("nees_verdict"),
-        refinement=list_refinement(run),
-        machine=list_machine(run),
+        refinement=report_facts.list_refinement(run),
+        machine=report_facts.list_machine(run),
         links=[(name, words) for name, words in _LINKED if (folder / name).is_file()],
         configuration=_configuration(run.entries),
     )

@@ -14,26 +14,11 @@ from sigmaslam.estimation.frame_clock import stamp_noise
 from sigmaslam.files import atomic_write_json, save_array, save_arrays
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
+from sigmaslam.run_record import frame_table, run_folder
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME
-from sigmaslam.run_record.frame_table import (
-    FRAMES_NAME,
-    STATUSES,
-    TRACKED,
-    FrameTable,
-    predicted_poses,
-    read_whole_frames,
-)
 from sigmaslam.run_record.inertial_file import describe_gravity, read_inertial_records
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, POSES_NAME, PoseRecords, read_pose_records, write_pose_table
 from sigmaslam.run_record.relative_pose_file import PARTIAL_RELATIVE_POSES, RELATIVE_POSES_NAME, collect_frame_pairs
-from sigmaslam.run_record.run_folder import (
-    FINAL_COVARIANCE,
-    FINAL_TRAJECTORY,
-    MAP_NAME,
-    REPORT_NAME,
-    RUN_NAME,
-    write_map_points,
-)
 from sigmaslam.run_record.verdict import calibration_verdict, expected_offset, explain_failure
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
@@ -78,10 +63,10 @@ def write_results(
         The summary, and the names of the files that could not be written; the log says why.
     """
     files = _Files(folder)
-    frames = read_whole_frames(folder / FRAMES_NAME)
+    frames = frame_table.read_whole_frames(folder / frame_table.FRAMES_NAME)
     records = read_pose_records(folder)
     records = records.select(records.timestamp <= frames.columns["timestamp"].max(initial=-np.inf) + 1e-9)
-    started, tracked = len(records) > 0, frames.count(TRACKED)
+    started, tracked = len(records) > 0, frames.count(frame_table.TRACKED)
     if not tracked:
         # A start that no second frame confirms is none.
         records = records.select(np.zeros(0, np.int64))
@@ -94,8 +79,8 @@ def write_results(
         for name, write in tracker.others.items():
             files.attempt(name, write)
         points = _write_map(files, tracker)
-    elif (folder / MAP_NAME).is_file():
-        with np.load(folder / MAP_NAME, allow_pickle=False) as point_map:
+    elif (folder / run_folder.MAP_NAME).is_file():
+        with np.load(folder / run_folder.MAP_NAME, allow_pickle=False) as point_map:
             points = len(point_map["points"])
     if tracker is not None:
         files.attempt(PICTURES_NAME, tracker.pictures)
@@ -111,17 +96,17 @@ def write_results(
     if len(records):
         summary |= describe_gravity(read_inertial_records(folder), records)
         if tracker is not None and tracker.judge_imu is not None:
-            by_images = ~predicted_poses(frames, records.timestamp)
+            by_images = ~frame_table.predicted_poses(frames, records.timestamp)
             judged = tracker.judge_imu(records.timestamp, records.pose, by_images)
             summary["imu"] = [asdict(each) for each in judged]
     summary["world"] = _describe_world(summary, run)
     summary["failure"] = explain_failure(summary, run.get("map") is not None, started, findings)
-    files.attempt(RUN_NAME, lambda path: atomic_write_json(path, {**run, "summary": summary}))
+    files.attempt(run_folder.RUN_NAME, lambda path: atomic_write_json(path, {**run, "summary": summary}))
     if len(frames):
         from sigmaslam.report.report import write_report  # not needed before the run has ended
 
-        files.attempt(REPORT_NAME, lambda path: write_report(path.parent))
-    of_folder += [name for name in files.failed if name in (RUN_NAME, REPORT_NAME)]
+        files.attempt(run_folder.REPORT_NAME, lambda path: write_report(path.parent))
+    of_folder += [name for name in files.failed if name in (run_folder.RUN_NAME, run_folder.REPORT_NAME)]
     if not of_folder:
         for name in (PARTIAL_POSES, PARTIAL_RELATIVE_POSES):
             (folder / name).unlink(missing_ok=True)
@@ -153,7 +138,7 @@ class _Files:
             self.failed.append(name)
 
 
-def _last_calibration(frames: FrameTable) -> CalibrationEstimate | None:
+def _last_calibration(frames: frame_table.FrameTable) -> CalibrationEstimate | None:
     """What frames.csv says of it; other errors than the disparity offset are not on disk."""
     offset, sigma = (frames.columns[name] for name in ("disparity_offset", "disparity_offset_sigma"))
     said = np.flatnonzero(np.isfinite(offset))
@@ -162,7 +147,7 @@ def _last_calibration(frames: FrameTable) -> CalibrationEstimate | None:
     return CalibrationEstimate(float(offset[said[-1]]), float(sigma[said[-1]]))
 
 
-def _write_poses(files: _Files, records: PoseRecords, frames: FrameTable, has_matching: bool) -> None:
+def _write_poses(files: _Files, records: PoseRecords, frames: frame_table.FrameTable, has_matching: bool) -> None:
     if not len(records):
         return
     trajectory = Trajectory(records.timestamp, records.pose)
@@ -187,9 +172,9 @@ def _write_final(files: _Files, tracker: TrackerResults, count: int) -> None:
     def write(path: Path) -> None:
         trajectory, covariances = final()
         write_tum(path, trajectory.subset(np.arange(count)))
-        files.attempt(FINAL_COVARIANCE, lambda path: save_array(path, covariances[:count]))
+        files.attempt(run_folder.FINAL_COVARIANCE, lambda path: save_array(path, covariances[:count]))
 
-    files.attempt(FINAL_TRAJECTORY, write)
+    files.attempt(run_folder.FINAL_TRAJECTORY, write)
 
 
 def _write_map(files: _Files, tracker: TrackerResults) -> int:
@@ -202,15 +187,15 @@ def _write_map(files: _Files, tracker: TrackerResults) -> int:
         arrays = {name: getattr(point_map, name) for name in PointMap.__slots__}
         save_arrays(path, **arrays, **tracker.keyframes())
 
-    files.attempt(MAP_NAME, write)
+    files.attempt(run_folder.MAP_NAME, write)
     if not made:
         return 0
-    files.attempt("map.ply", lambda path: write_map_points(path, made[0]))
+    files.attempt("map.ply", lambda path: run_folder.write_map_points(path, made[0]))
     return len(made[0].points)
 
 
 def _summarise(
-    frames: FrameTable, records: PoseRecords, calibration: CalibrationEstimate | None, points: int
+    frames: frame_table.FrameTable, records: PoseRecords, calibration: CalibrationEstimate | None, points: int
 ) -> dict[str, Any]:
     """Counts for run.json."""
     columns, status = frames.columns, np.array(frames.status, str)
@@ -218,12 +203,12 @@ def _summarise(
     first = int(np.abs(columns["timestamp"] - records.timestamp[0]).argmin()) if len(records) else None
     # Of tracked frames, that fewer than half of the matches agree with the pose; of skipped ones that could be read,
     # that one of their images is that of the frame before.
-    contradicted = np.isin(status, TRACKED) & (2.0 * columns["inliers"] < columns["matches"])
+    contradicted = np.isin(status, frame_table.TRACKED) & (2.0 * columns["inliers"] < columns["matches"])
     repeated = (status == "skipped") & np.isfinite(columns["belief"])
     return {
         "frames": len(frames),
-        **{each: frames.status.count(each) for each in STATUSES},
-        "tracked": frames.count(TRACKED),
+        **{each: frames.status.count(each) for each in frame_table.STATUSES},
+        "tracked": frames.count(frame_table.TRACKED),
         "doubts": _count_doubts(frames),
         "poses": len(records),
         "first_frame_with_pose": first,
@@ -236,7 +221,7 @@ def _summarise(
     }
 
 
-def _count_doubts(frames: FrameTable) -> dict[str, dict[str, float]]:
+def _count_doubts(frames: frame_table.FrameTable) -> dict[str, dict[str, float]]:
     """By reason: in how many frames, and the time of the first, seconds since the first frame."""
     counts: dict[str, dict[str, float]] = {}
     for seconds, doubts in zip(frames.seconds.tolist(), frames.doubts, strict=True):

@@ -17,18 +17,11 @@ from sigmaslam.errors import InputError
 from sigmaslam.files import atomic_write_text
 from sigmaslam.readers import StereoFrame, StereoSequence
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
+from sigmaslam.run_record import relative_pose_file
 from sigmaslam.run_record.appended_file import check_not_in_use
 from sigmaslam.run_record.frame_table import FRAMES_NAME, read_whole_frames
 from sigmaslam.run_record.inertial_file import cut_inertial_records
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, PoseRecords, read_pose_records, write_pose_records
-from sigmaslam.run_record.relative_pose_file import (
-    PARTIAL_RELATIVE_POSES,
-    RELATIVE_POSES_NAME,
-    FramePairs,
-    collect_frame_pairs,
-    read_frame_pairs,
-    write_partial_frame_pairs,
-)
 from sigmaslam.run_record.removal import remove_results
 from sigmaslam.run_record.run_folder import RUN_NAME
 from sigmaslam.slam.start_pose import StartPose
@@ -62,7 +55,7 @@ class StoppedRun:
     keyframe_at: float
     start: StartPose
     records: PoseRecords
-    pairs: FramePairs
+    pairs: relative_pose_file.FramePairs
 
     def check_sequence(self, sequence: StereoSequence) -> None:
         """The frames on disk are the first ones of the sequence, as far as that is known before it is read.
@@ -108,7 +101,7 @@ class StoppedRun:
     def make_ready(self) -> None:
         """Leaves the growing files alone in the folder, cut off where the run goes on."""
         write_pose_records(self.folder, self.records)
-        write_partial_frame_pairs(self.folder, self.pairs, self.records.timestamp)
+        relative_pose_file.write_partial_frame_pairs(self.folder, self.pairs, self.records.timestamp)
         lines = (self.folder / FRAMES_NAME).read_text(encoding="utf-8").splitlines(keepends=True)
         atomic_write_text(self.folder / FRAMES_NAME, "".join(lines[: len(self.timestamps) + 1]))
         cut_inertial_records(self.folder, float(self.timestamps[-1]))
@@ -174,18 +167,18 @@ def _check_entries(folder: Path, entries: dict[str, Any], run: dict[str, Any]) -
             raise InputError(f"{folder / RUN_NAME}: had another {name}{values}: give the same, or another --out")
 
 
-def _read_poses(folder: Path) -> tuple[PoseRecords, FramePairs]:
+def _read_poses(folder: Path) -> tuple[PoseRecords, relative_pose_file.FramePairs]:
     """From the growing files, or from the results where they are gone."""
-    if (folder / PARTIAL_POSES).is_file() and (folder / PARTIAL_RELATIVE_POSES).is_file():
+    if (folder / PARTIAL_POSES).is_file() and (folder / relative_pose_file.PARTIAL_RELATIVE_POSES).is_file():
         records = read_pose_records(folder)
-        return records, collect_frame_pairs(folder, records.timestamp)
+        return records, relative_pose_file.collect_frame_pairs(folder, records.timestamp)
     if not (folder / "trajectory.tum").is_file():
         raise InputError(f"{folder}: none of its frames has a pose to go on from: track anew with --overwrite")
     trajectory = read_tum(folder / "trajectory.tum")
     count = len(trajectory.timestamps)
     covariances = [read_covariances(folder / name, count) for name in ("covariance.npy", "covariance_matching.npy")]
     records = PoseRecords(trajectory.timestamps, trajectory.poses, *covariances)
-    return records, read_frame_pairs(folder / RELATIVE_POSES_NAME, count)
+    return records, relative_pose_file.read_frame_pairs(folder / relative_pose_file.RELATIVE_POSES_NAME, count)
 
 
 def _is_among(times: np.ndarray, others: np.ndarray) -> np.ndarray:
