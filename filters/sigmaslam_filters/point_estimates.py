@@ -255,11 +255,7 @@ def _check_options(iterations: int, on_failure: str) -> None:
 
 
 def _raise(
-    stage: str,
-    healthy: Tensor,
-    causes: Sequence[tuple[str, Tensor]],
-    problem: LeastSquares,
-    solution: Minimum,
+    stage: str, healthy: Tensor, causes: Sequence[tuple[str, Tensor]], problem: LeastSquares, solution: Minimum
 ) -> None:
     first = tuple((~healthy).nonzero()[0].tolist())
     cause = next(text for text, holds in causes if not bool(holds.expand_as(healthy)[first]))

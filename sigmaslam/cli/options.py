@@ -51,8 +51,7 @@ Weights = Annotated[
     ),
 ]
 Size = Annotated[
-    str | None,
-    typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the images, for files that do not name it."),
+    str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the images, for files that do not name it.")
 ]
 
 

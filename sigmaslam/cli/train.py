@@ -42,14 +42,12 @@ def network(
         ),
     ] = TrainingRecipe["full"],
     start: Annotated[
-        Path | None,
-        typer.Option("--from", help="Weights (.safetensors) to go on from.", show_default="the recipe's"),
+        Path | None, typer.Option("--from", help="Weights (.safetensors) to go on from.", show_default="the recipe's")
     ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Optimiser steps.", show_default="the recipe's")] = None,
     data: Annotated[Data | None, typer.Option(help="What pairs are made of.", show_default="the recipe's")] = None,
     worlds: Annotated[
-        str | None,
-        typer.Option(metavar="NAMES", help="Instead of --data: worlds and textures, as organ,leaves."),
+        str | None, typer.Option(metavar="NAMES", help="Instead of --data: worlds and textures, as organ,leaves.")
     ] = None,
     world: Annotated[
         Path | None, typer.Option(metavar="FILE.py", help="A world of your own, as examples/my_world.py.")

@@ -355,10 +355,7 @@ def _header(step: _Step, path: Path) -> Callable[[Mapping[str, Tensor]], dict[st
 
 
 def _difference(
-    step: _Step,
-    name: str,
-    run: Callable[[Mapping[str, Tensor]], dict[str, Tensor]],
-    sizes: Sequence[tuple[int, int]],
+    step: _Step, name: str, run: Callable[[Mapping[str, Tensor]], dict[str, Tensor]], sizes: Sequence[tuple[int, int]]
 ) -> float:
     """Largest difference from torch of what was written, on random arguments for batches and counts."""
     generator = torch.Generator().manual_seed(0)

@@ -14,16 +14,4 @@ from sigmaslam_filters.manifolds.spaces import (
     is_flat,
 )
 
-__all__ = [
-    "SE2",
-    "SE3",
-    "SO2",
-    "SO3",
-    "Euclidean",
-    "LieGroup",
-    "Manifold",
-    "Product",
-    "Space",
-    "is_flat",
-    "wrap_angle",
-]
+__all__ = ["SE2", "SE3", "SO2", "SO3", "Euclidean", "LieGroup", "Manifold", "Product", "Space", "is_flat", "wrap_angle"]

@@ -34,11 +34,7 @@ def _coefficients(squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     sine = torch.sin(angle)
     first = torch.where(small, 1.0 - squared / 6.0, sine / angle)
     second = torch.where(small, 0.5 - squared / 24.0, 2.0 * half * half)
-    third = torch.where(
-        small,
-        (1.0 - squared / 20.0) / 6.0,
-        (angle - sine) / (angle * safe),
-    )
+    third = torch.where(small, (1.0 - squared / 20.0) / 6.0, (angle - sine) / (angle * safe))
     return first, second, third
 
 
@@ -77,11 +73,9 @@ def log_se3(transform: Tensor) -> Tensor:
     first, second, _ = _coefficients(squared)
     small = squared < _SMALL * _SMALL
     safe = torch.where(small, torch.ones_like(squared), squared)
-    inverse_term = torch.where(
-        small,
-        (1.0 + squared / 60.0) / 12.0,
-        (1.0 - 0.5 * first / second) / safe,
-    )[..., None, None]
+    inverse_term = torch.where(small, (1.0 + squared / 60.0) / 12.0, (1.0 - 0.5 * first / second) / safe)[
+        ..., None, None
+    ]
     K = skew(rotation)
     identity = torch.eye(3, dtype=R.dtype, device=R.device)
     V_inverse = identity - 0.5 * K + inverse_term * (K @ K)
