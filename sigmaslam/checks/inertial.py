@@ -85,7 +85,7 @@ def _saturated(values: np.ndarray, ranges: np.ndarray) -> tuple[float, int]:
     """Size at which an axis of (N, 3) values stays at the end of a usual range, and for how many samples; or zeros."""
     for axis in np.abs(values).T:
         peak = float(axis.max())
-        top = np.flatnonzero(np.diff(np.r_[False, axis > 0.999 * peak, False].astype(int)))
+        top = np.flatnonzero(np.diff(np.r_[False, axis >= 0.999 * peak, False].astype(int)))
         flat = int(np.max(top[1::2] - top[::2]))
         if flat >= _FLAT and np.min(np.abs(peak / ranges - 1.0)) < _AT_END:
             return peak, flat

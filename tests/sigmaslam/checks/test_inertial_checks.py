@@ -50,6 +50,9 @@ def test_saturation_is_said():
     clipped = np.clip(samples.accel + [12.0, 0.0, 0.0], None, 2 * 9.80665 * 0.6)
     # Flat, but at the end of no sensor's range.
     assert check_inertial(replace(recording, samples=replace(samples, accel=clipped)), None).severity != "warning"
+    # A gyro of one axis.
+    level = replace(recording, samples=replace(samples, gyro=samples.gyro * [0.0, 0.0, 1.0]))
+    assert check_inertial(level, None).severity == "ok"
 
 
 @pytest.mark.parametrize(
