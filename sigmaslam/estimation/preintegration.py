@@ -78,7 +78,8 @@ def preintegrate(
     """
     t = samples.timestamp
     inside = t[(t > start) & (t < end)]
-    edges = np.r_[start, inside, end]
+    # Of one step alone, as in gaps, noise would be in six directions of nine.
+    edges = np.r_[start, inside if len(inside) else 0.5 * (start + end), end]
     gyro, accel = (interpolate(edges, t, each) for each in (samples.gyro - gyro_bias, samples.accel - accel_bias))
     steps, middles = np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
     # Length of the gap between samples that each step lies in.
