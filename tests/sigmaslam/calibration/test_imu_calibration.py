@@ -223,6 +223,25 @@ def test_what_cannot_be_calibrated_is_refused():
     faster = replace(recorded.samples, gyro=recorded.samples.gyro * 180 / np.pi)
     with pytest.raises(CalibrationError, match="are they in rad/s"):
         calibrate_imu(path, faster, start)
+    with pytest.raises(CalibrationError, match="a gyro alone"):
+        calibrate_imu(path, recorded.samples, replace(start, has_accelerometer=False))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("signs", [(-1, -1, -1), (1, -1, 1)], ids=["gravity instead of force", "mirrored"])
+def test_forces_of_another_motion_are_said(signs: tuple[int, int, int], caplog: pytest.LogCaptureFixture):
+    recorded = record(0, 4.0)
+    wrong = replace(recorded, samples=replace(recorded.samples, accel=recorded.samples.accel * signs))
+    calibrated(wrong, 0, 4.0)
+    assert "upwards at rest" in caplog.text
+
+
+@pytest.mark.long
+def test_a_gap_of_several_images_costs_little():
+    recorded = record(0, 4.0)
+    t = recorded.samples.timestamp
+    found = calibrated(replace(recorded, samples=recorded.samples.select((t < 1.0) | (t > 1.3))), 0, 4.0)
+    assert np.all(np.abs(recorded.error(found)) < 3.0 * np.sqrt(np.diag(found.covariance)))
 
 
 @pytest.mark.long
