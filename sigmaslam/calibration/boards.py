@@ -92,7 +92,11 @@ class Charuco:
 
     def detect(self, image: np.ndarray) -> DetectedCorners:
         """Corners between two markers that were read."""
-        pixels, ids, _, _ = cv2.aruco.CharucoDetector(self.opencv).detectBoard(image)
+        board = self.opencv
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
+        if ids is None or len(ids) < MIN_CORNERS:  # OpenCV before 4.6 printed even numbers of rows in another way
+            board.setLegacyPattern(True)
+            pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
         if ids is None or len(ids) < MIN_CORNERS:
             return NOTHING
         ids, pixels = ids.ravel().astype(np.int64), pixels.reshape(-1, 2)

@@ -5,13 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sigmaslam.calibration.boards import AprilGrid, Board, Chessboard, parse_board
+from sigmaslam.calibration.boards import AprilGrid, Board, Charuco, Chessboard, parse_board
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import se3_exp
 from tests.support.simulated_board import APRIL_GRID, CHARUCO, CHESSBOARD, FISHEYE, RADTAN, board_poses, draw_board
 
 # Turns Kalibr's grid, whose y goes up, so that it stands upright before a camera.
 UPRIGHT = se3_exp(np.array([0.0, 0.0, 0.0, np.pi, 0.0, 0.0]))
+
+
+def test_a_charuco_board_of_older_printings_is_read():
+    board = Charuco(8, 6, 0.035, 0.025, "DICT_5X5_100")
+    old = board.opencv
+    old.setLegacyPattern(True)
+    found = board.detect(np.pad(old.generateImage((960, 720)), 40, constant_values=255))
+    np.testing.assert_array_equal(found.ids, np.arange(35))
 
 
 @pytest.mark.long
