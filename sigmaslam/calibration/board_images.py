@@ -55,9 +55,13 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
     """
     files = [file for path in paths for file in _files_of(path)]
     alone: list[list[Path]] = []
+    untold: list[Path] = []
     for tell in eye_tellers():
         names = [name for name in map(tell, files) if name is not None]
-        if len(names) < len(files) or len({name.eye for name in names}) < 2:
+        if len({name.eye for name in names}) < 2 or 2 * len(names) <= len(files):
+            continue
+        if len(names) < len(files):
+            untold = untold or [file for file in files if tell(file) is None]
             continue
         kinds = [_moments(files, names, kind) for kind in range(len(names[0].moments))]
         moments = max(kinds, key=lambda each: sum(all(eyes) for eyes in each.values()))
@@ -74,6 +78,8 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
             f"no image of the left eye has one of the right eye beside it ({alone[0][0]}, {alone[0][1]}): give both "
             "images of a moment the same name but for the eye"
         )
+    if untold:
+        raise InputError(f"{untold[0]}: its name tells no eye, as those of most images do: leave it out, or name it so")
     _refuse_two_eyes(files)
     return [BoardImages(file.name, (file,)) for file in files]
 

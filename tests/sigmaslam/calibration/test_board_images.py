@@ -58,6 +58,13 @@ def test_eyes_whose_images_do_not_pair_are_refused(tmp_path: Path):
         find_board_images([tmp_path])
 
 
+def test_an_image_beside_those_of_two_eyes_is_named(tmp_path: Path):
+    """All of them made one camera of two, 3 sigmas from either."""
+    written(tmp_path, *(f"{eye}/{k}.png" for eye in ("left", "right") for k in (1, 2)), "debug/drawn.png")
+    with pytest.raises(InputError, match=r"debug/drawn\.png: its name tells no eye"):
+        find_board_images([tmp_path])
+
+
 def test_two_folders_of_equal_length_whose_eyes_no_name_tells_are_refused(tmp_path: Path):
     written(tmp_path, "a/1.png", "a/2.png", "b/1.png", "b/2.png", "b2/1.png")
     with pytest.raises(InputError, match="2 and 2 images, and no name says which eye"):
