@@ -22,6 +22,7 @@ from sigmaslam.calibration.lens_choice import calibrate_whole_images
 from sigmaslam.calibration.rectified_folder import write_rectified
 from sigmaslam.calibration_files.calibration_writer import describe_calibration
 from sigmaslam.calibration_files.foreign_calibrations import FORMS, write_foreign_calibration
+from sigmaslam.checks.inertial import check_inertial
 from sigmaslam.cli.extras import need_extra
 from sigmaslam.cli.options import Calibration, Format, Input, InputFormat, Size, read_sized
 from sigmaslam.errors import InputError
@@ -78,12 +79,16 @@ def board(
             "into OUT-camchain-imucam.yaml, by a board before the moved rig, or by a run of `track --imu off`.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the resamples of images that sigmas are compared with.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the resamples of images that sigmas are compared with.")] = 0,
 ) -> None:
     """Calibrate a stereo pair, or one camera, from images of a board, with the covariance of all parameters."""
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(f"{out}: a calibration is YAML; choose a name that ends in .yaml")
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: there is no folder {out.parent}: create it, or choose another")
     recording = None if imu is None else read_imu(imu, is_mounted=False)
+    if recording is not None and (judged := check_inertial(recording, None)).severity == "error":
+        raise InputError(judged.message)
     chain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
     if board is None:
         if recording is None or len(images) != 1:
