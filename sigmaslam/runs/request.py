@@ -127,8 +127,11 @@ class OutputOptions:
     save_calibration: Path | None = None
 
     def __post_init__(self) -> None:
-        if self.save_calibration is not None and self.save_calibration.exists():
-            raise InputError(f"{self.save_calibration}: there is such a file: give --save-calibration another name")
+        path = self.save_calibration
+        if path is not None and path.exists():
+            raise InputError(f"{path}: there is such a file: give --save-calibration another name")
+        if path is not None and (path.suffix.lower() not in (".yaml", ".yml") or not path.parent.is_dir()):
+            raise InputError(f"{path}: give --save-calibration a name that ends in .yaml, in a folder that is there")
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,3 +47,6 @@ def test_a_file_that_is_there_is_not_overwritten(demo_sequence: Path, tmp_path: 
     result = run_here("track", demo_sequence, "--out", tmp_path / "run", "--save-calibration", tmp_path / "old.yaml")
     assert_refused(result, "old.yaml", "another name")
     assert (tmp_path / "old.yaml").read_text() == "mine"
+    for name in ("new.txt", "nowhere/new.yaml"):
+        command = "track", demo_sequence, "--out", tmp_path / "run", "--save-calibration", tmp_path / name
+        assert_refused(run_here(*command), name, "ends in .yaml, in a folder that is there")
