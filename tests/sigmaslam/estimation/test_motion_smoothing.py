@@ -87,3 +87,20 @@ def test_what_was_not_measured_later_changes_nothing():
 
 def test_no_frames_are_smoothed_to_none():
     assert smooth_motion([]).step.shape == (0, 4, 4)
+
+
+def test_turns_that_are_hardly_known_are_left_as_they_were_predicted():
+    """Frames in the dark before a shaken camera: linear, the pass would swing to and fro and claim less than before."""
+    motion = MotionFilter()
+    motion.set_twist(np.r_[0.05, 0.0, 0.0, 0.1, 0.05, 0.0], np.full(6, TWIST_SIGMA))
+    chain = [MotionLink(0.0, motion.state, motion.state)]
+    for k in range(1, 13):
+        motion.predict(0.05, np.array([1.0, 4000.0]))
+        predicted = motion.state
+        if k == 12:
+            motion.correct(se3_exp(np.r_[0.03, 0.0, 0.0, 0.1, 0.0, 0.0]), 1e-6 * np.eye(6))
+        chain.append(MotionLink(0.05 * k, predicted, motion.state))
+    smoothed = smooth_motion(chain)
+    for link, step, covariance in zip(chain, smoothed.step, smoothed.covariance, strict=True):
+        assert np.trace(covariance) <= 1.001 * np.trace(link.filtered.covariance[:6, :6])
+        assert np.linalg.norm(se3_log(step)[3:]) < 0.2
