@@ -24,6 +24,7 @@ from sigmaslam.run_record.run_folder import check_has_trajectory, describe_versi
 from sigmaslam.slam.point_map import PointMap
 
 _LOGGER = logging.getLogger(__name__)
+_LOST = 4.0  # and more: variances of a lost frame over those of its keyframes
 _COUNTS = ("observations", "outliers", "far_landmarks", "bridges", "iterations", "solves", "converged", "dof")
 
 
@@ -69,7 +70,7 @@ def refine_run(run: Path, out: Path, tell: Callable[[str], None] = lambda note: 
         "seconds_adjust": adjusted - read,
         "versions": describe_versions("sigmaslam", "numpy", "gtsam"),
     }
-    _write(out, trajectory, adjustment)
+    _write(out, trajectory, covariances, adjustment)
     atomic_write_json(out / REFINE_NAME, summary)
     _add_to_report(run, out, summary)
     return summary
@@ -101,11 +102,22 @@ def keyframe_before(frames: np.ndarray, count: int) -> np.ndarray:
     return np.maximum(np.searchsorted(frames, np.arange(count), side="right") - 1, 0)
 
 
-def _write(out: Path, trajectory: Trajectory, adjustment: Adjustment) -> None:
+def spread_covariances(frames: np.ndarray, refined: np.ndarray, tracked: np.ndarray) -> np.ndarray:
+    """Covariances (N, 6, 6) of all frames: of the keyframe after, as the first one's is zero, or of the last one.
+
+    Frames that are much less certain than the keyframes around them, as while lost, keep what was `tracked` (N, 6, 6).
+    """
+    size, before = np.trace(tracked, axis1=1, axis2=2), keyframe_before(frames, len(tracked))
+    after = np.searchsorted(frames, np.arange(len(tracked))).clip(max=len(frames) - 1)
+    is_lost = size > _LOST * np.maximum(size[frames[before]], size[frames[after]])
+    return np.where(is_lost[:, None, None], tracked, refined[after])
+
+
+def _write(out: Path, trajectory: Trajectory, covariances: np.ndarray, adjustment: Adjustment) -> None:
     refined = spread_corrections(trajectory, adjustment.frames, adjustment.poses)
     write_tum(out / "trajectory.tum", refined)
     write_kitti(out / "trajectory.kitti", refined, out / "times.txt")
-    save_array(out / "covariance.npy", adjustment.covariances[keyframe_before(adjustment.frames, len(trajectory))])
+    save_array(out / "covariance.npy", spread_covariances(adjustment.frames, adjustment.covariances, covariances))
     count = len(adjustment.points)
     # The adjustment does not keep the keyframe and the pixel that first saw a point.
     unknown = np.full((count, 4), np.nan)

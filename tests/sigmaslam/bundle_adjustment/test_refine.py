@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 from sigmaslam.bundle_adjustment import Adjustment, RefineConfig, Tracks, adjust, refine_run
-from sigmaslam.bundle_adjustment.refine_run import spread_corrections
+from sigmaslam.bundle_adjustment.refine_run import spread_corrections, spread_covariances
 from sigmaslam.bundle_adjustment.structure import collect, fit_structure, point_covariances
 from sigmaslam.cli.commands import app
 from sigmaslam.errors import InputError
@@ -213,8 +213,9 @@ def test_the_command_writes_what_evaluate_reads(run_folder: Path, tmp_path: Path
     assert refined.ate_origin.rmse < 0.3 * tracked.ate_origin.rmse
     assert refined.nees is not None
     covariance = np.load(out / "covariance.npy")
-    np.testing.assert_array_equal(covariance[3], covariance[5])  # that of the keyframe before
-    assert not covariance[:3].any()
+    np.testing.assert_array_equal(covariance[4], covariance[6])  # that of the keyframe after
+    assert not covariance[0].any()
+    assert (np.trace(covariance[1:], axis1=1, axis2=2) > 0.0).all()
     np.testing.assert_allclose(
         evaluate_run(out / "trajectory.kitti", tmp_path / "truth.tum", plot=False).ate.rmse, refined.ate.rmse, rtol=1e-6
     )
@@ -325,6 +326,12 @@ def test_times_and_rows_are_those_of_the_run(run_folder: Path, tmp_path: Path):
     before, after = read_tum(run_folder / "trajectory.tum"), read_tum(tmp_path / "out" / "trajectory.tum")
     np.testing.assert_array_equal(before.timestamps, after.timestamps)
     np.testing.assert_allclose(after.poses[0], before.poses[0], atol=1e-9)
+
+
+def test_frames_that_were_lost_keep_the_covariance_of_the_run():
+    tracked = np.array([0.0, 0.1, 1.0, 900.0, 1.2, 1.3])[:, None, None] * np.eye(6)
+    spread = spread_covariances(np.array([0, 4]), np.array([0.0, 0.5])[:, None, None] * np.eye(6), tracked)
+    np.testing.assert_array_equal(spread[:, 0, 0], [0.0, 0.5, 0.5, 900.0, 0.5, 0.5])
 
 
 @pytest.mark.slow
