@@ -36,6 +36,7 @@ try:
     from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
     from message_filters import ApproximateTimeSynchronizer, Subscriber
     from nav_msgs.msg import Odometry
+    from rclpy.executors import ExternalShutdownException
     from rclpy.node import Node
     from rclpy.qos import qos_profile_sensor_data
     from rclpy.time import Time
@@ -117,8 +118,9 @@ class ContinuousOdometry:
         before, step = self.pose, None if self._last is None else seconds - self._last[0]
         if jumps and before is not None:
             expected = before @ se3_exp(self.twist * (step or 0.0))
+            left_out = se3_log(se3_inverse(expected) @ self.T_odom_map @ T_map_base) * (step is None)  # while lost
             self.T_odom_map = expected @ se3_inverse(T_map_base)
-            self._before_jumps = turn_covariance(before, self.covariance)
+            self._before_jumps = turn_covariance(before, self.covariance + np.outer(left_out, left_out))
         self.pose = self.T_odom_map @ T_map_base
         self.covariance = covariance + turn_covariance(se3_inverse(self.pose), self._before_jumps)
         if before is not None and step is not None and self._last is not None and not jumps:
@@ -139,8 +141,8 @@ class SigmaSlamNode(Node):
     def __init__(self) -> None:
         super().__init__("sigmaslam")
         self._given = {name: self.declare_parameter(name, default).value for name, default in PARAMETERS.items()}
-        self._topics = [self._given["left"], self._given["right"]]
-        self._info_topics = [str(PurePosixPath(topic).parent / "camera_info") for topic in self._topics]
+        self._topics = [self.resolve_topic_name(self._given[eye]) for eye in ("left", "right")]
+        self._info_topics = [self._find_info_topic(self._given[eye]) for eye in ("left", "right")]
         self.failure: Exception | None = None
         self._infos: list[CameraInfo | None] = [None, None]
         self._heard, self._dropped, self._late, self._heard_at = [0, 0], 0, 0, time.monotonic()
@@ -161,11 +163,19 @@ class SigmaSlamNode(Node):
         for eye, topic in enumerate(self._info_topics):
             self.create_subscription(CameraInfo, topic, partial(self._take_info, eye), qos_profile_sensor_data)
             eyes[eye].registerCallback(partial(self._count, eye))
-        self._pairs = ApproximateTimeSynchronizer(eyes, 10, self._given["slop"])
+        self._pairs = ApproximateTimeSynchronizer(eyes, 10, self._given["slop"] + 1e-9)  # which takes what is below
         self._pairs.registerCallback(self._take_pair)
         self.create_timer(SILENCE, self._watch)
         self._thread = threading.Thread(target=self._work, name="sigmaslam", daemon=True)
         self._thread.start()
+
+    def _find_info_topic(self, images: str) -> str:
+        """Beside the images, wherever they are remapped to, unless it is remapped itself."""
+        own = str(PurePosixPath(images).parent / "camera_info")
+        resolved = self.resolve_topic_name(own)
+        if resolved != self.resolve_topic_name(own, only_expand=True):
+            return resolved
+        return str(PurePosixPath(self.resolve_topic_name(images)).parent / "camera_info")
 
     def destroy_node(self) -> None:
         """Ends the tracking first."""
@@ -212,6 +222,8 @@ class SigmaSlamNode(Node):
                 self._odometry.forget_velocity()
                 self._diagnose(DiagnosticStatus.ERROR, str(error), pair[0].header.stamp)
             except Exception as error:  # the node ends, in place of going on without its thread
+                if not rclpy.ok():  # nothing can be published any more
+                    return
                 self._diagnose(DiagnosticStatus.ERROR, str(error), pair[0].header.stamp)
                 self.get_logger().fatal(traceback.format_exc())
                 self.failure = error
@@ -365,7 +377,7 @@ def main() -> None:
     try:
         while rclpy.ok() and node.failure is None:
             rclpy.spin_once(node, timeout_sec=0.1)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         node.destroy_node()

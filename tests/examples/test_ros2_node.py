@@ -326,6 +326,19 @@ def test_eyes_further_apart_than_the_slop_are_no_pair(start: Callable[..., Any])
     assert "1 on left/image_raw, 1 on right/image_raw: raise `slop`" in words
 
 
+def test_what_is_remapped_is_heard_by_its_own_name(start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(StubNode, "remapped", {"left/image_raw": "/cam/l/image_rect", "right/camera_info": "/info"})
+    node = start()
+    assert node._topics == ["/cam/l/image_rect", "right/image_raw"]
+    assert node._info_topics == ["/cam/l/camera_info", "/info"]
+
+
+def test_without_a_slop_equal_stamps_are_a_pair(start: Callable[..., Any], demo: Any):
+    node = start(slop=0.0)
+    tell_calibration(node, demo[0])
+    track(node, blank(1))
+
+
 def test_what_is_missing_is_said_and_waited_for(start: Callable[..., Any], demo: Any):
     sequence, frames = demo
     mounting = StubBuffer.transforms.pop(("base_link", "left_optical"))
@@ -423,6 +436,18 @@ def test_a_loop_and_a_return_jump_in_the_map_and_not_in_odom(start: Callable[...
     assert spreads[3] < spreads[4] < spreads[6]  # what was not known before a jump stays
 
 
+def test_what_is_left_out_after_a_loss_stays_in_the_covariance(example: ModuleType):
+    generator = np.random.default_rng(1)
+    before, after, later = (se3_exp(generator.normal(size=6)) for _ in range(3))
+    odometry, tiny = example.ContinuousOdometry(), 1e-6 * np.eye(6)
+    odometry.update(1.0, before, tiny, tiny, False)
+    odometry.forget_velocity()
+    for seconds, pose, jumps in ((2.0, after, True), (2.1, later, False)):
+        odometry.update(seconds, pose, tiny, tiny, jumps)
+        error = se3_log(se3_inverse(odometry.pose) @ pose)
+        assert error @ np.linalg.solve(odometry.covariance, error) < 1.5
+
+
 def test_a_velocity_and_its_covariance_are_those_of_two_poses(example: ModuleType):
     generator = np.random.default_rng(0)
     twist, first = generator.normal(size=6), se3_exp(generator.normal(size=6))
@@ -478,3 +503,31 @@ def test_main_ends_with_the_reason(example: ModuleType, monkeypatch: pytest.Monk
     with pytest.raises(SystemExit, match="error: images on left/image_raw have no time stamps"):
         example.main()
     assert calls == ["init", "shutdown"]
+
+
+def test_a_signal_while_a_frame_is_tracked_ends_quietly(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch, start: Callable[..., Any]
+):
+    """As rclpy: spinning raises, and publishers of a context that is shut down do, too."""
+    start()
+    rclpy, nodes, is_on, crashes = example.rclpy, [], [True], []
+    monkeypatch.setattr(rclpy, "init", lambda args: None)
+    monkeypatch.setattr(rclpy, "ok", lambda: is_on[0])
+    monkeypatch.setattr(rclpy, "try_shutdown", lambda: None)
+    monkeypatch.setattr(threading, "excepthook", crashes.append)
+
+    def refuse(message: Any) -> None:
+        raise RuntimeError("Failed to publish: publisher's context is invalid")
+
+    def spin_once(node: Any, timeout_sec: float) -> None:
+        nodes.append(node)
+        is_on[0] = False
+        node._diagnostics.publish = refuse
+        deliver(node, blank(1)[0], 0)
+        time.sleep(0.1)
+        raise example.ExternalShutdownException
+
+    monkeypatch.setattr(rclpy, "spin_once", spin_once)
+    example.main()
+    assert nodes[0].failure is None
+    assert not crashes

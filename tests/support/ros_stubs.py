@@ -72,10 +72,12 @@ class StubNode:
 
     Attributes:
         given: parameters that the command line would set; for all nodes.
+        remapped: topics that it would remap, likewise.
         published: messages by topic; transforms under "/tf".
     """
 
     given: dict[str, Any] = {}  # noqa: RUF012
+    remapped: dict[str, str] = {}  # noqa: RUF012
 
     def __init__(self, name: str) -> None:
         self._stub_name = name
@@ -86,6 +88,9 @@ class StubNode:
 
     def get_name(self) -> str:
         return self._stub_name
+
+    def resolve_topic_name(self, topic: str, only_expand: bool = False) -> str:
+        return topic if only_expand else self.remapped.get(topic, topic)
 
     def get_logger(self) -> Any:
         return SimpleNamespace(fatal=self.logged.append)
@@ -138,7 +143,7 @@ class StubSynchronizer:
 
     def __init__(self, filters: list[StubSubscriber], queue_size: int, slop: float) -> None:
         self._waiting: tuple[dict[int, Any], dict[int, Any]] = ({}, {})
-        self._size, self._slop = queue_size, slop * 1e9
+        self._size, self._slop = queue_size, int(slop * 1e9)
         self._calls: list[Callable[[Any, Any], None]] = []
         for eye, each in enumerate(filters):
             each.registerCallback(lambda message, eye=eye: self._add(eye, message))
@@ -150,7 +155,7 @@ class StubSynchronizer:
         stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         own, other = self._waiting[eye], self._waiting[1 - eye]
         own[stamp] = message
-        near = [each for each in other if abs(each - stamp) <= self._slop]
+        near = [each for each in other if abs(each - stamp) < self._slop]  # as the real one
         if near:
             partner = other.pop(min(near, key=lambda each: abs(each - stamp)))
             del own[stamp]
@@ -162,6 +167,10 @@ class StubSynchronizer:
 
 class TransformException(Exception):  # noqa: N818
     """As of tf2_ros."""
+
+
+class ShutDownFromOutside(Exception):  # noqa: N818
+    """As rclpy's, of a signal."""
 
 
 class StubBuffer:
@@ -184,7 +193,8 @@ class StubBuffer:
 def stubbed_ros() -> Iterator[None]:
     """Imports of ROS find these stubs."""
     modules = {
-        "rclpy": {"init": None, "ok": None, "spin_once": None, "try_shutdown": None},
+        "rclpy": {"init": None, "ok": lambda: True, "spin_once": None, "try_shutdown": None},
+        "rclpy.executors": {"ExternalShutdownException": ShutDownFromOutside},
         "rclpy.node": {"Node": StubNode},
         "rclpy.qos": {"qos_profile_sensor_data": "sensor data"},
         "rclpy.time": {"Time": _Time},
