@@ -4,8 +4,10 @@ A folder holds the images in KITTI's or EuRoC's layout with calibration, times a
 everything can be made again; `truth/NNNNNN.npz` for each frame; `landmarks.npz`; and, if asked for, an inertial sensor.
 """
 
+import hashlib
 import json
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
@@ -126,7 +128,9 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> None:
     Raises:
         InputError: the folder holds something else.
     """
-    asked = {"recipe": asdict(recipe), "truth": truth}
+    asked: dict[str, Any] = {"recipe": asdict(recipe), "truth": truth}
+    if recipe.world is not None:
+        asked["world_sha256"] = hashlib.sha256(Path(recipe.world).read_bytes()).hexdigest()
     scene = out / SCENE_NAME
     if scene.is_file():
         try:
@@ -134,7 +138,8 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> None:
         except (OSError, ValueError) as error:
             raise InputError(f"{scene} cannot be read ({error}); remove it or choose another --out") from error
         # Folders from before there were worlds of one's own, and inertial sensors, lack the keys.
-        there = {"recipe": {"world": None, "imu": None, **content.get("recipe", {})}, "truth": content.get("truth")}
+        there = {name: content.get(name) for name in asked}
+        there["recipe"] = {"world": None, "imu": None, **content.get("recipe", {})}
         if there != asked:
             raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")
         return
@@ -189,11 +194,11 @@ def join_tracks(out: Path, frames: int) -> None:
 def command(recipe: Recipe, truth: str) -> str:
     """The command line that writes the same folder again."""
     plain = Recipe(recipe.preset, recipe.frames)
-    words = ["sigmaslam", "render", recipe.preset, "--out", "DIR", "--frames", str(recipe.frames)]
+    words = ["sigmaslam", "train", "render", recipe.preset, "--out", "DIR", "--frames", str(recipe.frames)]
     for name, value in asdict(recipe).items():
         if name not in ("preset", "frames") and (value != getattr(plain, name) or name == "seed"):
             words += [f"--{name.replace('_', '-')}", str(value)]
-    return " ".join(words if truth == "dense" else [*words, "--truth", truth])
+    return shlex.join(words if truth == "dense" else [*words, "--truth", truth])
 
 
 def _render(out: Path, truth: str, device: str, recipe: Recipe) -> int:

@@ -77,7 +77,8 @@ class ScenePairs:
     ) -> None:
         if not domains:
             raise ValueError(f"there are no domains; give one or more of {', '.join(DOMAINS)}")
-        self._generators = {domain: _generator(domain) for domain in domains}
+        for domain in domains:
+            _generator(domain)  # not kept: a function of the user's file cannot be sent to another process
         if stereo and forward:
             raise ValueError("pairs are of one kind: give stereo or forward")
         self.seed, self.size, self.domains, self.stereo, self.forward = seed, size, domains, stereo, forward
@@ -127,7 +128,7 @@ class ScenePairs:
             first_texture=4 * (self.seed + scene // _SCENES_A_BANK),
             textures=4,
         )
-        episode = self._generators[domain](rng, wish)
+        episode = _generator(domain)(rng, wish)
         renderer = Renderer(episode.scene)
         middle = rng.uniform(1.0, _DURATION - 1.0)
         span = np.exp(rng.uniform(np.log(0.1), np.log(2.0)))

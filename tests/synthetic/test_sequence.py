@@ -228,6 +228,22 @@ def test_a_folder_of_another_recipe_is_refused_and_kept(organ: Path, tmp_path: P
         write_sequence(tmp_path, RECIPE)
 
 
+def test_a_folder_of_a_world_that_was_edited_is_refused(tmp_path: Path) -> None:
+    world, example = tmp_path / "world.py", Path(__file__).resolve().parents[2] / "examples" / "my_world.py"
+    recipe = Recipe("organ", 1, width=64, height=48, world=str(world))
+    world.write_text(example.read_text())
+    assert [write_sequence(tmp_path / "out", recipe) for _ in range(2)] == [0, 1]
+    world.write_text(example.read_text() + "# edited\n")
+    with pytest.raises(InputError, match="world_sha256"):
+        write_sequence(tmp_path / "out", recipe)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("frames", [1, 5, 10])
+def test_a_short_drive_stops(frames: int) -> None:
+    assert simulate(Recipe("street", frames, motion="stops", width=64, height=48)).frames == frames
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

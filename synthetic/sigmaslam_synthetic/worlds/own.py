@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sigmaslam.errors import InputError
+from sigmaslam_synthetic.rendering.renderer import Renderer
 from sigmaslam_synthetic.worlds.episode import Episode, Wish
 
 Generate = Callable[[np.random.Generator, Wish], Episode]
@@ -55,9 +56,12 @@ def check_world(path: str) -> None:
     generate = load_world(path)
     try:
         episode = generate(np.random.default_rng(0), Wish(duration=2.0))
+        if isinstance(episode, Episode):
+            Renderer(episode.scene)
     except Exception as error:  # whatever the user's code raises
         raise InputError(
-            f"{path}: generate(rng, wish) fails ({type(error).__name__}: {error}): mend it, {_EXAMPLE}"
+            f"{path}: generate(rng, wish), or its rendering, fails ({type(error).__name__}: {error}): mend it, "
+            f"{_EXAMPLE}"
         ) from error
     if not isinstance(episode, Episode):
         raise InputError(f"{path}: generate(rng, wish) returns {type(episode).__name__}, not an Episode, {_EXAMPLE}")

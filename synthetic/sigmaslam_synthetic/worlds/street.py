@@ -42,7 +42,7 @@ def _drive(rng: np.random.Generator, wish: Wish) -> tuple[Path, np.ndarray]:
     ease = min(4.0, duration / 5)
     stops = 1 + int(duration > 25)
     if wish.motion == "stops":
-        duration -= 0.5 * ease + 1.0
+        duration = max(duration - 0.5 * ease - 1.0, 1.0)
     if wish.motion == "loop":
         size = max(8.0 * duration / 5.4, 20.0)
         box = random_motions.FreeSpace(
