@@ -12,8 +12,9 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import nn
 
-from sigmaslam.errors import InputError
+from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam_models.network_export import load_network
 from sigmaslam_training import devices
 from sigmaslam_training.features import loop
@@ -85,6 +86,16 @@ def test_a_stopped_run_ends_as_one_that_was_not_stopped(finished, tiny, tmp_path
     expected = json.loads((finished / CARD_NAME).read_text())["metrics_on_held_out_renders"]
     assert card["metrics_on_held_out_renders"] == expected
     assert logged_steps(tmp_path) == [4]
+
+
+@pytest.mark.long
+def test_a_loss_that_is_no_number_ends_the_run_and_keeps_its_checkpoint(tiny, tmp_path, monkeypatch):
+    no_number = {"name": "clip_grad_norm_", "value": lambda *others: torch.tensor(np.nan)}
+    in_step(2, lambda: monkeypatch.setattr(nn.utils, **no_number), monkeypatch)
+    with pytest.raises(SigmaSlamError, match="step 2: the loss is no finite number"):
+        train(tmp_path, tiny, workers=0, recipe="quick")
+    with safe_open(tmp_path / CHECKPOINT_NAME, framework="pt") as file:
+        assert int(file.metadata()["step"]) == 2
 
 
 @pytest.mark.long

@@ -1,5 +1,6 @@
 """Sources of one's own: shares become turns, what cannot be used is refused before long work, and it can be trained."""
 
+import pickle
 import re
 from collections import Counter
 from pathlib import Path
@@ -102,7 +103,11 @@ def test_what_cannot_be_trained_on_is_refused_before_anything_is_written(
     [
         ("import nothing_of_this_name", r"cannot be run \(ModuleNotFoundError: No module named 'nothing_of"),
         ("def make(rng, wish): ...", r"has no function generate\(rng, wish\)"),
-        ("def generate(rng, wish): return 1 / 0", r"generate\(rng, wish\) fails \(ZeroDivisionError"),
+        (
+            "def generate(rng, wish): return 1 / 0",
+            r"generate\(rng, wish\), or its rendering, fails \(ZeroDivisionError",
+        ),
+        (BENCH.read_text().replace("Scene(tuple(bodies)", "Scene(()"), "generate.* fails"),
         ("def generate(rng, wish): return 'street'", r"generate\(rng, wish\) returns str, not an Episode"),
     ],
 )
@@ -116,7 +121,9 @@ def test_a_file_that_makes_no_world_is_refused_by_name(code: str, message: str, 
 
 
 def test_a_world_of_one_s_own_gives_pairs_with_truth():
-    pair = open_stream(str(BENCH), 3, 96).pair(0)
+    stream = open_stream(str(BENCH), 3, 96)
+    assert b"sigmaslam_world" not in pickle.dumps(stream)  # a worker knows no module of that name
+    pair = stream.pair(0)
     assert pair.image0.shape == (96, 96)
     assert pair.image0.std() > 0.02
     points = np.stack(np.meshgrid(np.arange(8.0, 90.0, 8), np.arange(8.0, 90.0, 8)), -1).reshape(-1, 2)
@@ -131,6 +138,13 @@ def test_a_rendered_sequence_shows_the_world_of_the_file():
     assert kinds == {"wood", "glyphs", "checker", "strokes"}
     assert simulation.rig.left.width == 64
     assert simulate(Recipe("organ", 2, 5, width=64, height=48)).scene != simulation.scene
+
+
+def test_a_path_that_ends_before_the_last_image_is_refused(tmp_path: Path):
+    world = tmp_path / "short.py"
+    atomic_write_text(world, BENCH.read_text().replace("wish.duration", "0.1"))
+    with pytest.raises(InputError, match=r"short\.py: its path is from 0 to 0\.1 s, not from 0 to 0\.44 s"):
+        simulate(Recipe("organ", 10, world=str(world)))
 
 
 def test_photographs_are_textures_that_depend_on_seed_alone(photographs: Path):

@@ -76,3 +76,7 @@ def test_every_run_is_validated_on_the_same_and_endoscopes_on_endoscopy_too():
     assert usual == ("leaves", "patterns", "scenes")
     assert all(held_out_sources(mix) == usual for mix in MIXES if mix != "endoscope")
     assert held_out_sources("endoscope") == (*usual, "endoscopy")
+
+
+def test_an_image_that_shows_nothing_has_no_matches(network):
+    assert set(match_pair(network, Same(np.zeros((96, 96), np.float32))).metrics().values()) == {0.0}

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from sigmaslam.errors import SigmaSlamError
 from sigmaslam.files import atomic_write_json, make_folder
 from sigmaslam.progress import open_progress
 from sigmaslam_training.devices import Workplace, loss_module, open_workplace, to_device
@@ -156,7 +157,8 @@ class _Run:
         loss: PairLoss = self._loss(batch, torch.Generator().manual_seed(seed))
         state.optimizer.zero_grad(set_to_none=True)
         (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
-        nn.utils.clip_grad_norm_(state.network.parameters(), 1.0)
+        if not nn.utils.clip_grad_norm_(state.network.parameters(), 1.0).isfinite():
+            raise SigmaSlamError(f"step {state.step}: the loss is no finite number: mend its source, then --resume")
         state.optimizer.step()
         state.schedule.step()
         state.step += 1

@@ -96,6 +96,8 @@ def match_pair(network: FeatureNetwork, pair: Pair) -> PairMatches:
     (keypoints0, descriptors0), (keypoints1, descriptors1) = extract(pair.image0), extract(pair.image1)
     network.train(was_training)
     similarity = descriptors0 @ descriptors1.T
+    if not similarity.numel():  # an image that shows nothing
+        return PairMatches(keypoints0[:0], keypoints1[:0], torch.empty(0), torch.empty(0))
     best1 = similarity.argmax(dim=1)
     mutual = similarity.argmax(dim=0)[best1] == torch.arange(len(best1))
     places1, visible = pair.transfer(keypoints0.numpy())
