@@ -25,6 +25,7 @@ _MIN_COMMON = 3
 # Length of the cameras' axes, which are aligned together with the path, as a share of its size: they settle the
 # rotation about a straight path, and little else.
 _AXIS = 0.01
+_OTHER = 0.1  # and more: distance of two recordings over the extent of one
 # Entries of run.json that are no settings.
 _RESULTS = ("summary", "checks", "started", "ended", "dropped", "real_time")
 
@@ -115,6 +116,8 @@ def _place(run: RecordedRun, first: RecordedRun) -> _Placed:
     distance = np.linalg.norm(moved.positions[rows] - first.trajectory.positions[others], axis=1)
     evaluated = None if run.evaluated is None else replace(run.evaluated, truth=best.apply(run.evaluated.truth))
     note = f"is aligned to the first run by {'the truth' if by_truth else 'the paths'} at {known.sum()} common times"
+    if np.sqrt(np.mean(distance**2)) > _OTHER * np.linalg.norm(np.ptp(first.trajectory.positions[others], axis=0)):
+        note += " and hardly follows it: is it of another recording?"
     run = replace(run, trajectory=moved, evaluated=evaluated)
     return _Placed(run, float(first.frames.columns["timestamp"][0]), note, run.of_frames(distance, rows))
 

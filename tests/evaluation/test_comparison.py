@@ -61,6 +61,16 @@ def test_runs_of_one_recording_lie_on_each_other(tmp_path):
     assert "two is aligned to the first run by the paths at 25 common times." in page.words
 
 
+def test_runs_at_the_same_times_in_two_places_are_doubted(tmp_path):
+    _two_runs(tmp_path)
+    path = tmp_path / "two" / "trajectory.tum"
+    there = read_tum(path)
+    poses = there.poses.copy()
+    poses[:, :3, 3] = poses[::-1, [1, 2, 0], 3] ** 2
+    write_tum(path, Trajectory(there.timestamps, poses))
+    assert "common times and hardly follows it: is it of another recording?" in _compare(tmp_path, "one", "two").words
+
+
 def test_each_run_has_its_lines_figures_and_settings(tmp_path):
     _two_runs(tmp_path)
     page = _compare(tmp_path, "one", "two")
