@@ -202,9 +202,9 @@ def _step(system: tuple[np.ndarray, ...], weights: np.ndarray, damping: float) -
     """Steps of the rig (P,) and of the poses (n, 6)."""
     _, across, pull, information, gradient = system
     matrix, vector = np.tensordot(weights, information, 1), weights @ gradient
-    scale = np.sqrt(np.diag(matrix))
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     if not np.all(scale > 0.0):
-        raise CalibrationError("the images leave a camera parameter open: take more of them, with the board tilted")
+        raise CalibrationError("a camera parameter is open: is --board another one? Else take more, the board tilted")
     normal = matrix / np.outer(scale, scale) + damping * np.eye(len(scale))
     step = np.linalg.solve(normal, vector / scale) / scale
     return step, pull - across @ step

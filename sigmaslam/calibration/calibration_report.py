@@ -146,12 +146,12 @@ def _draw_corners(axes: "Axes", result: BoardCalibration, k: int, eye: CameraMod
 
 
 def _doubts(result: BoardCalibration) -> list[str]:
-    doubts = []
+    is_off, why = result.rms > 1.0, "is --board another one, does the board bend, or are the images blurred?"
+    doubts = [f"residuals of {result.rms:.2f} px are large (0.1 to 0.3 are usual): {why}"] * is_off
     for k, (name, eye) in enumerate(zip(_names(result), result.rig.eyes, strict=True)):
         if coverage(result, k) < _COVERED:
-            doubts.append(
-                f"{name}: large parts of the image show no board, there the lens is extrapolated: move it there"
-            )
+            why = "there the lens is extrapolated: move it there"
+            doubts.append(f"{name}: large parts of the image show no board, {why}")
         if folds(eye):
             doubts.append(
                 f"{name}: the lens model folds before the image's corners: show the board there, "

@@ -25,7 +25,7 @@ from sigmaslam.calibration_files.foreign_calibrations import FORMS, write_foreig
 from sigmaslam.checks.inertial import check_inertial
 from sigmaslam.cli.extras import need_extra
 from sigmaslam.cli.options import Calibration, Format, Input, InputFormat, Size, read_sized
-from sigmaslam.errors import InputError
+from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.progress import counted
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.inertial import read_imu
@@ -113,6 +113,11 @@ def board(
         result = calibrate_whole_images(seen.names, seen.views, plan.points, seen.sizes)
     else:
         result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
+    try:
+        describe_board_calibration(result)  # before long work
+    except CalibrationError as error:
+        why = "are all images of one pose, is --board another one, or are the eyes exchanged?"
+        raise CalibrationError(f"rms {result.rms:.2f} px, and {error}: {why}") from error
     with counted("sigmas", RESAMPLES) as done:
         result = widened(result, bootstrap_rigs(result, RESAMPLES, seed, done))
     typer.echo(describe_board_calibration(result))

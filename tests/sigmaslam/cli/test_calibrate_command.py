@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 from pathlib import Path
 
@@ -118,6 +119,11 @@ def test_boards_with_markers_calibrate_a_pair(tmp_path: Path, plan: Board, words
         for key in ("fx", "fy", "cx", "cy"):
             assert abs(getattr(found, key) - getattr(true, key)) < 4.0 * sigmas[f"{name}.{key}"]
     assert camera.baseline == pytest.approx(np.linalg.norm(rig.T_left_right[:3, 3]), rel=2e-3)
+    if isinstance(plan, AprilGrid):
+        wrong = run_here("calibrate", tmp_path, "--board", "aprilgrid:4x3:0.05:0.2", "--out", out)
+        assert re.search(r"residuals of \d\.\d+ px are large .*is --board another one", wrong.stdout)
+        turned = run_here("calibrate", tmp_path, "--board", "aprilgrid:3x4:0.05:0.3", "--out", out)
+        assert_refused(turned, "is --board another one")
 
 
 @pytest.mark.long
@@ -136,6 +142,9 @@ def test_bad_requests_are_refused(rendered: Path, tmp_path: Path):
     assert_refused(run_here("calibrate", rendered, "--board", "grid", "--out", out), "--board is 'grid'")
     assert_refused(run_here("calibrate", rendered, "--board", BOARD, "--out", tmp_path / "a.xml"), "is YAML")
     assert_refused(run_here("calibrate", tmp_path / "no", "--board", BOARD, "--out", out), "no such file or folder")
+    nowhere = run_here("calibrate", rendered, "--board", BOARD, "--out", tmp_path / "nowhere" / "stereo.yaml")
+    assert_refused(nowhere, "there is no folder")
+    assert run_here("calibrate", rendered, "--board", BOARD, "--out", out, "--seed", "-1").returncode == 2
     wrong = run_here("calibrate", rendered, "--board", "chessboard:13x4:0.025", "--out", out)
     assert_refused(wrong, "the board is found in none of 12 images: check --board")
     assert not out.exists()
