@@ -6,17 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sigmaslam.bundle_adjustment import structure
 from sigmaslam.bundle_adjustment.solver import Solver
-from sigmaslam.bundle_adjustment.structure import (
-    Observations,
-    Structure,
-    choose,
-    collect,
-    fit_structure,
-    point_covariances,
-    seen_again,
-    whitened_residuals,
-)
 from sigmaslam.bundle_adjustment.track_file import Tracks
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.se3 import rigid_motion, se3_inverse, turn_covariance
@@ -104,7 +95,7 @@ def adjust(
         InputError: gtsam is not installed, there is nothing to adjust, or the tracks do not fix all poses.
     """
     config = config or RefineConfig()
-    observations, frames = collect(tracks)
+    observations, frames = structure.collect(tracks)
     if len(frames) < 2:
         raise InputError("all observations are of one keyframe: there is no motion to adjust; track more frames")
     T_left_rectified = rigid_motion(tracks.R_rectified_left.T, np.zeros(3))
@@ -112,28 +103,30 @@ def adjust(
     offset = float(tracks.disparity_offset[0])
     rectified = turn_covariance(se3_inverse(T_left_rectified), covariances[frames])
     solver = Solver(observations, tracked, rectified, tell)
-    selection = _Selection(observations, seen_again(observations, np.ones(len(observations), bool)), config, tell)
+    selection = _Selection(
+        observations, structure.seen_again(observations, np.ones(len(observations), bool)), config, tell
+    )
 
     repeated = selection.repeated
-    structure, far = selection.fit(repeated, tracked, offset)
-    kept = choose(observations, repeated, structure, tracked, offset, config.min_significance, gated=False)
+    landmarks, far = selection.fit(repeated, tracked, offset)
+    kept = structure.choose(observations, repeated, landmarks, tracked, offset, config.min_significance, gated=False)
     if not kept.any():
         raise InputError(
-            f"none of {len(structure.points)} landmarks is seen by two keyframes and near enough to have a depth: "
+            f"none of {len(landmarks.points)} landmarks is seen by two keyframes and near enough to have a depth: "
             "there is nothing to adjust"
         )
-    solution = solver.solve(kept, tracked, structure.points, offset, robust=True)
-    kept, structure = selection.inliers(kept, solution.poses, offset)
-    solution = solver.solve(kept, solution.poses, structure.points, offset)
-    kept, structure = selection.inliers(kept, solution.poses, offset)
+    solution = solver.solve(kept, tracked, landmarks.points, offset, robust=True)
+    kept, landmarks = selection.inliers(kept, solution.poses, offset)
+    solution = solver.solve(kept, solution.poses, landmarks.points, offset)
+    kept, landmarks = selection.inliers(kept, solution.poses, offset)
     while True:
         solution, curvature, by_offset = solver.solve_with_offset(
-            kept, solution.poses, structure.points, solution.offset, config.offset_sigma
+            kept, solution.poses, landmarks.points, solution.offset, config.offset_sigma
         )
         # Reject landmarks that have moved to infinity. The limit is halved, or those near it would come and go.
-        structure, far = selection.fit(kept, solution.poses, solution.offset)
+        landmarks, far = selection.fit(kept, solution.poses, solution.offset)
         limit = 0.5 * config.min_significance
-        near = choose(observations, kept, structure, solution.poses, solution.offset, limit, gated=False)
+        near = structure.choose(observations, kept, landmarks, solution.poses, solution.offset, limit, gated=False)
         if np.array_equal(near, kept):
             break
         kept = near
@@ -147,13 +140,13 @@ def adjust(
     bridges = len(solver.bridges(kept))
     components = int(np.where(observations.stereo[kept], 3, 2).sum())
     dof = components - 3 * len(used) - 6 * (len(frames) - 1) - 1 + 6 * bridges
-    before = fit_structure(observations, kept, tracked, offset)
+    before = structure.fit_structure(observations, kept, tracked, offset)
     return Adjustment(
         frames=frames,
         poses=solution.poses @ se3_inverse(T_left_rectified),
         covariances=turn_covariance(T_left_rectified, covariance),
         points=solution.points[used],
-        point_covariances=point_covariances(observations, kept, solution.poses, solution.points)[used],
+        point_covariances=structure.point_covariances(observations, kept, solution.poses, solution.points)[used],
         point_views=np.bincount(observations.landmark[kept], minlength=len(observations.host))[used],
         disparity_offset=solution.offset,
         disparity_offset_sigma=sigma,
@@ -174,12 +167,12 @@ def adjust(
 class _Selection:
     """Chooses among the `repeated` observations (O,) bool, those of landmarks that two keyframes or more see."""
 
-    observations: Observations
+    observations: structure.Observations
     repeated: np.ndarray
     config: RefineConfig
     tell: Callable[[str], None]
 
-    def fit(self, kept: np.ndarray, poses: np.ndarray, offset: float) -> tuple[Structure, np.ndarray]:
+    def fit(self, kept: np.ndarray, poses: np.ndarray, offset: float) -> tuple[structure.Structure, np.ndarray]:
         """Points at fixed poses, and which repeated observations (O,) are of far landmarks.
 
         Landmarks without a kept observation use all of theirs.
@@ -187,26 +180,26 @@ class _Selection:
         self.tell("points by themselves")
         landmark = self.observations.landmark
         unused = np.bincount(landmark[kept], minlength=len(self.observations.host)) == 0
-        structure = fit_structure(self.observations, kept | (self.repeated & unused[landmark]), poses, offset)
-        return structure, self.repeated & ~(structure.significance >= self.config.min_significance)[landmark]
+        landmarks = structure.fit_structure(self.observations, kept | (self.repeated & unused[landmark]), poses, offset)
+        return landmarks, self.repeated & ~(landmarks.significance >= self.config.min_significance)[landmark]
 
-    def inliers(self, kept: np.ndarray, poses: np.ndarray, offset: float) -> tuple[np.ndarray, Structure]:
+    def inliers(self, kept: np.ndarray, poses: np.ndarray, offset: float) -> tuple[np.ndarray, structure.Structure]:
         """Inliers (O,) of a solution, and points that fit it."""
-        structure, far = self.fit(kept, poses, offset)
+        landmarks, far = self.fit(kept, poses, offset)
         limit = self.config.min_significance
-        inliers = choose(self.observations, self.repeated, structure, poses, offset, limit, gated=True)
+        inliers = structure.choose(self.observations, self.repeated, landmarks, poses, offset, limit, gated=True)
         near = int((self.repeated & ~far).sum())
         if inliers.sum() < max(_MIN_SHARE * near, 1):
             raise InputError(
                 f"{inliers.sum()} of {near} observations agree on where things are: too few. Are trajectory and "
                 "tracks of the same run?"
             )
-        return inliers, structure
+        return inliers, landmarks
 
 
 def _sum_of_squares(
-    observations: Observations, kept: np.ndarray, poses: np.ndarray, points: np.ndarray, offset: float
+    observations: structure.Observations, kept: np.ndarray, poses: np.ndarray, points: np.ndarray, offset: float
 ) -> float:
     points = np.nan_to_num(points)
-    residuals, _ = whitened_residuals(observations, poses, points, offset)
+    residuals, _ = structure.whitened_residuals(observations, poses, points, offset)
     return float(np.sum(residuals[kept] ** 2))

@@ -3,24 +3,27 @@
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sigmaslam.bounded_files import read_json
 from sigmaslam.bundle_adjustment.adjustment import Adjustment, RefineConfig, adjust
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam
-from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, read_tracks
+from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, Tracks, read_tracks
 from sigmaslam.errors import InputError
+from sigmaslam.estimation.calibration_errors import ERRORS, measured_errors
 from sigmaslam.files import atomic_write_json, check_new_folder, make_folder, save_array, save_arrays
+from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.frame_table import FRAMES_NAME
 from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY, read_final_trajectory
-from sigmaslam.run_record.run_folder import check_has_trajectory, describe_versions, write_map_points
+from sigmaslam.run_record.run_folder import RUN_NAME, check_has_trajectory, describe_versions, write_map_points
 from sigmaslam.slam.point_map import PointMap
 
 _LOGGER = logging.getLogger(__name__)
@@ -46,7 +49,7 @@ def refine_run(run: Path, out: Path, tell: Callable[[str], None] = lambda note: 
     check_has_trajectory(run)
     check_new_folder(out)
     _, trajectory = read_final_trajectory(run)
-    tracks = read_tracks(run / TRACKS_NAME, len(trajectory))
+    tracks, errors = _without_errors(run, read_tracks(run / TRACKS_NAME, len(trajectory)))
     covariances = read_covariances(run / "covariance.npy", len(trajectory))
     make_folder(out)
     read = time.perf_counter()
@@ -64,6 +67,7 @@ def refine_run(run: Path, out: Path, tell: Callable[[str], None] = lambda note: 
         "cost_per_dof_after": adjustment.cost_after,
         "disparity_offset_before": float(tracks.disparity_offset[0]),
         "disparity_offset_before_sigma": float(tracks.disparity_offset[1]),
+        "calibration_errors": errors,
         "disparity_offset": adjustment.disparity_offset,
         "disparity_offset_sigma": adjustment.disparity_offset_sigma,
         "seconds_read": read - began,
@@ -74,6 +78,18 @@ def refine_run(run: Path, out: Path, tell: Callable[[str], None] = lambda note: 
     atomic_write_json(out / REFINE_NAME, summary)
     _add_to_report(run, out, summary)
     return summary
+
+
+def _without_errors(run: Path, tracks: Tracks) -> tuple[Tracks, dict[str, list[float]]]:
+    """The tracks of a pair without the errors that the run found in it, and these; the offset is adjusted."""
+    path, mean = run / RUN_NAME, np.zeros(len(ERRORS))
+    entries = read_json(path, "the run", "track again") if path.is_file() else {}
+    errors = entries.get("summary", {}).get("calibration_errors") or {}
+    for name, (value, _) in errors.items():
+        mean[ERRORS.index(name)] = value
+    fx, fy, cx, cy, baseline = tracks.intrinsics.tolist()
+    by_error = measured_errors(RectifiedStereo(fx, fy, cx, cy, baseline, 0, 0), tracks.measurement)
+    return replace(tracks, measurement=tracks.measurement - by_error @ mean), errors
 
 
 def spread_corrections(trajectory: Trajectory, frames: np.ndarray, poses: np.ndarray) -> Trajectory:
