@@ -175,8 +175,7 @@ def track(
     stream: Annotated[
         str | None,
         typer.Option(
-            metavar="TARGET",
-            help="Give out each pose when it is known, as a line of JSON: stdout, or udp://HOST:PORT.",
+            metavar="TARGET", help="Give out each pose when it is known, as a line of JSON: stdout, or udp://HOST:PORT."
         ),
     ] = None,
     video: Annotated[
@@ -194,8 +193,7 @@ def track(
     serve: Annotated[
         str | None,
         typer.Option(
-            metavar="[HOST:]PORT",
-            help="Show the run on a web page, read-only; for this machine alone without a HOST.",
+            metavar="[HOST:]PORT", help="Show the run on a web page, read-only; for this machine alone without a HOST."
         ),
     ] = None,
     dense: Annotated[

@@ -11,13 +11,8 @@ from sigmaslam.bounded_files import check_columns, load_arrays, read_json
 from sigmaslam.errors import InputError
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum
+from sigmaslam.run_record import evaluated_frames
 from sigmaslam.run_record.dense_points import DENSE_NAME, RecordedPoints, read_dense_points
-from sigmaslam.run_record.evaluated_frames import (
-    EVALUATED_FRAMES_NAME,
-    EVALUATION_NAME,
-    EvaluatedFrames,
-    read_evaluated_frames,
-)
 from sigmaslam.run_record.frame_pictures import PICTURES_NAME, FramePictures, read_pictures
 from sigmaslam.run_record.frame_table import FRAMES_NAME, FrameTable, read_frames
 from sigmaslam.run_record.inertial_file import InertialRecords, read_inertial_records
@@ -60,7 +55,7 @@ class RecordedRun:
     entries: dict[str, Any]
     evaluation: dict[str, Any]
     refinement: dict[str, Any]
-    evaluated: EvaluatedFrames | None
+    evaluated: evaluated_frames.EvaluatedFrames | None
     inertial: InertialRecords | None
     pairs: FramePairs | None
 
@@ -108,7 +103,7 @@ def read_run(folder: Path) -> RecordedRun:
     pose_row = np.searchsorted(frames.columns["timestamp"], trajectory.timestamps - 1e-6)
     if len(pose_row) and pose_row.max() >= len(frames):
         raise InputError(f"{folder / FRAMES_NAME}: ends before trajectory.tum: both must come from the same run")
-    path, count, errors = folder / "covariance.npy", len(trajectory), folder / EVALUATED_FRAMES_NAME
+    path, count, errors = folder / "covariance.npy", len(trajectory), folder / evaluated_frames.EVALUATED_FRAMES_NAME
     relative = folder / RELATIVE_POSES_NAME
     return RecordedRun(
         folder=folder,
@@ -122,9 +117,9 @@ def read_run(folder: Path) -> RecordedRun:
         dense=read_dense_points(folder / DENSE_NAME) if (folder / DENSE_NAME).is_file() else None,
         pictures=read_pictures(folder / PICTURES_NAME) if (folder / PICTURES_NAME).is_file() else None,
         entries=_read_json(folder / RUN_NAME, "track"),
-        evaluation=_read_json(folder / EVALUATION_NAME, "evaluate"),
+        evaluation=_read_json(folder / evaluated_frames.EVALUATION_NAME, "evaluate"),
         refinement=_read_json(folder / REFINE_NAME, "refine"),
-        evaluated=read_evaluated_frames(errors, count) if errors.is_file() else None,
+        evaluated=evaluated_frames.read_evaluated_frames(errors, count) if errors.is_file() else None,
         inertial=read_inertial_records(folder),
         pairs=read_frame_pairs(relative, count) if relative.is_file() else None,
     )

@@ -60,8 +60,7 @@ def check_world(path: str) -> None:
             Renderer(episode.scene)
     except Exception as error:  # whatever the user's code raises
         raise InputError(
-            f"{path}: generate(rng, wish), or its rendering, fails ({type(error).__name__}: {error}): mend it, "
-            f"{_EXAMPLE}"
+            f"{path}: generate(rng, wish) or its rendering fails ({type(error).__name__}: {error}): mend it, {_EXAMPLE}"
         ) from error
     if not isinstance(episode, Episode):
         raise InputError(f"{path}: generate(rng, wish) returns {type(episode).__name__}, not an Episode, {_EXAMPLE}")
