@@ -143,8 +143,8 @@ def calibrate_imu(
     times, measured = path.times, path.poses
     if len(times) < _FEWEST or np.max(np.diff(times)) > _LONGEST:
         raise CalibrationError(
-            f"{len(times)} images with a pose lie within the inertial table's {t[0]:.1f} to {t[-1]:.1f} s; {_FEWEST} must, "
-            f"none over {_LONGEST:g} s from the next: have both one clock, keep the board in view, move and turn the rig"
+            f"{len(times)} images with a pose lie within the table's {t[0]:.1f} to {t[-1]:.1f} s, {_FEWEST} must, none "
+            f"over {_LONGEST:g} s from the next: have both one clock, keep the board in view, move and turn the rig"
         )
     state = _start(times, measured, samples, sensor)
     roots = np.linalg.cholesky(np.linalg.inv(path.covariances)).transpose(0, 2, 1)
