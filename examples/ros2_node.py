@@ -159,7 +159,8 @@ class SigmaSlamNode(Node):
         self._pose_publisher = self.create_publisher(geometry.PoseWithCovarianceStamped, "~/pose", 10)
         self._odometry_publisher = self.create_publisher(Odometry, "~/odometry", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        eyes = [Subscriber(self, Image, topic, qos_profile=qos_profile_sensor_data) for topic in self._topics]
+        given = [self._given[eye] for eye in ("left", "right")]  # a name that is resolved would be remapped again
+        eyes = [Subscriber(self, Image, topic, qos_profile=qos_profile_sensor_data) for topic in given]
         for eye, topic in enumerate(self._info_topics):
             self.create_subscription(CameraInfo, topic, partial(self._take_info, eye), qos_profile_sensor_data)
             eyes[eye].registerCallback(partial(self._count, eye))
@@ -172,9 +173,8 @@ class SigmaSlamNode(Node):
     def _find_info_topic(self, images: str) -> str:
         """Beside the images, wherever they are remapped to, unless it is remapped itself."""
         own = str(PurePosixPath(images).parent / "camera_info")
-        resolved = self.resolve_topic_name(own)
-        if resolved != self.resolve_topic_name(own, only_expand=True):
-            return resolved
+        if self.resolve_topic_name(own) != self.resolve_topic_name(own, only_expand=True):
+            return own
         return str(PurePosixPath(self.resolve_topic_name(images)).parent / "camera_info")
 
     def destroy_node(self) -> None:
@@ -220,7 +220,8 @@ class SigmaSlamNode(Node):
                 self._track(*pair)
             except FrameError as error:
                 self._odometry.forget_velocity()
-                self._diagnose(DiagnosticStatus.ERROR, str(error), pair[0].header.stamp)
+                if rclpy.ok():
+                    self._diagnose(DiagnosticStatus.ERROR, str(error), pair[0].header.stamp)
             except Exception as error:  # the node ends, in place of going on without its thread
                 if not rclpy.ok():  # nothing can be published any more
                     return

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from sigmaslam.bounded_files import read_json
 from sigmaslam.bundle_adjustment.adjustment import Adjustment, RefineConfig, adjust
 from sigmaslam.bundle_adjustment.gtsam_bridge import load_gtsam
 from sigmaslam.bundle_adjustment.track_file import TRACKS_NAME, Tracks, read_tracks
@@ -22,8 +21,9 @@ from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import read_covariances, read_tum, write_kitti, write_tum
 from sigmaslam.report.report import write_report
 from sigmaslam.run_record.frame_table import FRAMES_NAME
-from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY, read_final_trajectory
+from sigmaslam.run_record.recorded_run import REFINE_NAME, REFINED_TRAJECTORY, read_final_trajectory, read_table
 from sigmaslam.run_record.run_folder import RUN_NAME, check_has_trajectory, describe_versions, write_map_points
+from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.point_map import PointMap
 
 _LOGGER = logging.getLogger(__name__)
@@ -81,12 +81,10 @@ def refine_run(run: Path, out: Path, tell: Callable[[str], None] = lambda note: 
 
 
 def _without_errors(run: Path, tracks: Tracks) -> tuple[Tracks, dict[str, list[float]]]:
-    """The tracks of a pair without the errors that the run found in it, and these; the offset is adjusted."""
-    path, mean = run / RUN_NAME, np.zeros(len(ERRORS))
-    entries = read_json(path, "the run", "track again") if path.is_file() else {}
-    errors = entries.get("summary", {}).get("calibration_errors") or {}
-    for name, (value, _) in errors.items():
-        mean[ERRORS.index(name)] = value
+    """The tracks without the pair's errors that the run found, and these: but the offset, and of a rig that changed."""
+    summary = read_table(run / RUN_NAME, "track").get("summary") or {}
+    errors = {} if Doubt.RIG in summary.get("doubts", {}) else summary.get("calibration_errors") or {}
+    mean = np.array([errors.get(name, [0.0])[0] for name in ERRORS])
     fx, fy, cx, cy, baseline = tracks.intrinsics.tolist()
     by_error = measured_errors(RectifiedStereo(fx, fy, cx, cy, baseline, 0, 0), tracks.measurement)
     return replace(tracks, measurement=tracks.measurement - by_error @ mean), errors

@@ -57,37 +57,38 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
     alone: list[list[Path]] = []
     untold: list[Path] = []
     for tell in eye_tellers():
-        names = [name for name in map(tell, files) if name is not None]
-        if len({name.eye for name in names}) < 2 or 2 * len(names) <= len(files):
+        told = [(file, name) for file in files if (name := tell(file)) is not None]
+        if len({name.eye for _, name in told}) < 2:
             continue
-        if len(names) < len(files):
-            untold = untold or [file for file in files if tell(file) is None]
+        kinds = [_moments(told, kind) for kind in range(len(told[0][1].moments))]
+        moments = max(kinds, key=lambda each: sum(map(all, each.values())))
+        is_paired = any(map(all, moments.values()))
+        if len(told) < len(files):
+            untold += [file for file in files if is_paired and tell(file) is None]
             continue
-        kinds = [_moments(files, names, kind) for kind in range(len(names[0].moments))]
-        moments = max(kinds, key=lambda each: sum(all(eyes) for eyes in each.values()))
-        if any(all(eyes) for eyes in moments.values()):
+        if is_paired:
             # 2 comes before 10.
             order = sorted(moments, key=lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), name))
             return [
                 BoardImages(" + ".join(file.name for file in moments[name] if file), tuple(moments[name]))
                 for name in order
             ]
-        alone.append([next(f for f, n in zip(files, names, strict=True) if n.eye == k) for k in (0, 1)])
+        alone.append([next(file for file, name in told if name.eye == k) for k in (0, 1)])
     if alone:
         raise InputError(
             f"no image of the left eye has one of the right eye beside it ({alone[0][0]}, {alone[0][1]}): give both "
             "images of a moment the same name but for the eye"
         )
     if untold:
-        raise InputError(f"{untold[0]}: its name tells no eye, as those of most images do: leave it out, or name it so")
+        raise InputError(f"{untold[0]}: its name tells no eye, others do: leave it out; of one camera: rename those")
     _refuse_two_eyes(files)
     return [BoardImages(file.name, (file,)) for file in files]
 
 
-def _moments(files: Sequence[Path], names: Sequence[EyeName], kind: int) -> dict[str, list[Path | None]]:
+def _moments(told: Sequence[tuple[Path, EyeName]], kind: int) -> dict[str, list[Path | None]]:
     """The files of both eyes, by one of `EyeName.moments`; nothing where several would have the same name by it."""
     moments: dict[str, list[Path | None]] = {}
-    for file, name in zip(files, names, strict=True):
+    for file, name in told:
         eyes = moments.setdefault(name.moments[kind], [None, None])
         other = eyes[name.eye]
         if other is not None and other.parent == file.parent and other.stem == file.stem:

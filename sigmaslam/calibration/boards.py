@@ -94,7 +94,7 @@ class Charuco:
         """Corners between two markers that were read."""
         board = self.opencv
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
-        if ids is None or len(ids) < MIN_CORNERS:  # OpenCV before 4.6 printed even numbers of rows in another way
+        if self.rows % 2 == 0 and (ids is None or len(ids) < MIN_CORNERS):  # OpenCV before 4.6 printed another one
             board.setLegacyPattern(True)
             pixels, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
         if ids is None or len(ids) < MIN_CORNERS:

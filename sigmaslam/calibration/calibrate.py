@@ -270,13 +270,15 @@ def _solve_without_outliers(rig: Rig, corners: Corners) -> tuple[BoardBundle, Co
         bundle = solve_bundle(rig, start, replace(corners, image=positions))
         rig = bundle.rig
         squared = np.sum(bundle.residuals**2, axis=1)
-        # A quarter, as single wrong corners are left out below, and one eye that is misread is half of a pair.
+        # A quarter, as single wrong corners are left out below, and one eye that is misread is about half of a pair.
         sizes = np.sqrt([np.quantile(squared[positions == k], 0.75) for k in range(len(numbers))])
         wrong = sizes > OUTLIER_IMAGE * np.median(sizes)
         if wrong.any():
             for image, size in zip(numbers[wrong].tolist(), sizes[wrong].tolist(), strict=True):
                 times = size / np.median(sizes)
-                refused.append((image, f"a quarter of its corners are {size:.2f} px off, {times:.1f} times the usual"))
+                refused.append(
+                    (image, f"a quarter of its corners are {size:.2f} px off or more, {times:.1f} times as usual")
+                )
             dropped |= np.isin(all_corners.image, numbers[wrong])
             continue
         limit = OUTLIER_CORNER * float(np.sqrt(np.median(squared))) / _MEDIAN_DISTANCE

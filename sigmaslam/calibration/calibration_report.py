@@ -146,30 +146,23 @@ def _draw_corners(axes: "Axes", result: BoardCalibration, k: int, eye: CameraMod
 
 
 def _doubts(result: BoardCalibration) -> list[str]:
-    is_off, why = result.rms > 1.0, "is --board another one, does the board bend, or are the images blurred?"
-    doubts = [f"residuals of {result.rms:.2f} px are large (0.1 to 0.3 are usual): {why}"] * is_off
+    doubts = []
+    if result.rms > 1.0:
+        doubts.append(f"residuals of {result.rms:.2f} px (0.1 to 0.3 are usual): another --board, a bent one, or blur?")
     for k, (name, eye) in enumerate(zip(_names(result), result.rig.eyes, strict=True)):
         if coverage(result, k) < _COVERED:
-            why = "there the lens is extrapolated: move it there"
-            doubts.append(f"{name}: large parts of the image show no board, {why}")
+            doubts.append(f"{name}: large parts of the image show no board, the lens is extrapolated: move it there")
         if folds(eye):
-            doubts.append(
-                f"{name}: the lens model folds before the image's corners: show the board there, "
-                "or try --lens radtan4 or equidistant"
-            )
+            doubts.append(f"{name}: the lens folds before the corners: show the board there, or try another --lens")
         if eye.distortion_model == "radtan" and len(eye.distortion) > 4:
             last = len(eye.distortion) - 1
             sigma = float(result.sigmas[result.rig.names.index(f"{name}.d{last}")])
             if abs(eye.distortion[last]) < sigma:
-                doubts.append(
-                    f"{name}: the last coefficient of the lens is {eye.distortion[last]:.3f} ± {sigma:.3f}, "
-                    "nothing: try --lens radtan4"
-                )
+                found = f"{eye.distortion[last]:.3f} ± {sigma:.3f}"
+                doubts.append(f"{name}: the last coefficient of the lens is {found}, nothing: try --lens radtan4")
         focal = float(result.sigmas[result.rig.names.index(f"{name}.fx")]) / eye.fx
         if focal > 0.01:
-            doubts.append(
-                f"{name}: the focal length is known to {100 * focal:.0f} %: tilt the board by 30 to 45 degrees"
-            )
+            doubts.append(f"{name}: the focal length is known to {100 * focal:.0f} %: tilt the board by 30 degrees")
     return doubts
 
 

@@ -38,10 +38,8 @@ _FIRST_SCALE, _CONVERGED = 25.0, 1e-6
 # So many rounds integrate the samples anew; after them biases and delay hardly move, and the first order will do.
 _INTEGRATED = 3
 # Turns that are off by more are in another unit (focal lengths of few views are off by a tenth); those of which less is
-# explained are of another motion.
-_SCALE_TOLERANCE, _EXPLAINED = 0.3, 0.7
-# Noise of forces, m/s^2/sqrt(Hz), as of a wrong sign, axis or unit (0.13 and more; MH_01 0.003, at 20 Hz 0.03).
-_FOREIGN_FORCE = 0.1
+# explained are of another motion. Forces, m/s^2/sqrt(Hz), have 0.13 of a wrong sign or axis, MH_01's 0.003 to 0.03.
+_SCALE_TOLERANCE, _EXPLAINED, _FOREIGN_FORCE = 0.3, 0.7, 0.1
 # Images: fewer say nothing; they lie no further apart than that, seconds.
 _FEWEST, _LONGEST = 20, 2.0
 # Power spectra of accelerations that nobody measured, across gaps, m^2/s^3 and rad^2/s^3: those of a hand.
@@ -136,8 +134,6 @@ def calibrate_imu(
         CalibrationError: too few images within the table's time, turns that are not the gyro's, or a motion that leaves
             something open.
     """
-    if not sensor.has_accelerometer:
-        raise CalibrationError("a gyro alone says nothing of the lever arm: give the specific force, too")
     t = samples.timestamp - sensor.time_shift
     path = path.select((path.times > t[0] + 0.1) & (path.times < t[-1] - 0.1))
     times, measured = path.times, path.poses

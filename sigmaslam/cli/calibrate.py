@@ -87,6 +87,8 @@ def board(
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}: create it, or choose another")
     recording = None if imu is None else read_imu(imu, is_mounted=False)
+    if recording is not None and not recording.sensor.has_accelerometer:
+        raise InputError(f"{imu}: a gyro alone says nothing of the lever arm: give the specific force, too")
     if recording is not None and (judged := check_inertial(recording, None)).severity == "error":
         raise InputError(judged.message)
     chain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
@@ -113,11 +115,10 @@ def board(
         result = calibrate_whole_images(seen.names, seen.views, plan.points, seen.sizes)
     else:
         result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
-    try:
-        describe_board_calibration(result)  # before long work
+    try:  # what makes no stereo pair says so before long work
+        describe_board_calibration(result)
     except CalibrationError as error:
-        why = "are all images of one pose, is --board another one, or are the eyes exchanged?"
-        raise CalibrationError(f"rms {result.rms:.2f} px, and {error}: {why}") from error
+        raise CalibrationError(f"rms {result.rms:.2f} px, {error}: one pose, another board, exchanged eyes?") from error
     with counted("sigmas", RESAMPLES) as done:
         result = widened(result, bootstrap_rigs(result, RESAMPLES, seed, done))
     typer.echo(describe_board_calibration(result))

@@ -10,10 +10,17 @@ from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.live.frame_sink import TrackedFrame
-from sigmaslam.reconstruction import reconstruct
 from sigmaslam.reconstruction.cloud import VoxelCloud, write_cloud
 from sigmaslam.reconstruction.depth_fusion import DepthView
 from sigmaslam.reconstruction.disparity import semi_global_disparity
+from sigmaslam.reconstruction.reconstruct import (
+    NEIGHBOURS,
+    default_voxel,
+    fuse_keyframe,
+    least_views,
+    make_picture,
+    measure_view,
+)
 from sigmaslam.reconstruction.recorded_keyframes import MOST_FRAMES, RecordedKeyframes
 from sigmaslam.run_record.dense_points import DENSE_NAME, write_dense_points
 from sigmaslam.run_record.relative_pose_file import FramePairs
@@ -53,28 +60,26 @@ class CloudSink:
             return
         self._since = 0
         offset = said.calibration.disparity_offset
-        view = reconstruct.measure_view(
-            seen.left, seen.right, self._rectifier, semi_global_disparity, offset, seen.usable
-        )
+        view = measure_view(seen.left, seen.right, self._rectifier, semi_global_disparity, offset, seen.usable)
         self._views = [
-            *self._views[-2 * reconstruct.NEIGHBOURS :],
-            (said, reconstruct.make_picture(seen.left, frame.colour, self._rectifier), view),
+            *self._views[-2 * NEIGHBOURS :],
+            (said, make_picture(seen.left, frame.colour, self._rectifier), view),
         ]
-        if len(self._views) > reconstruct.NEIGHBOURS:
-            self._fuse(len(self._views) - 1 - reconstruct.NEIGHBOURS)
+        if len(self._views) > NEIGHBOURS:
+            self._fuse(len(self._views) - 1 - NEIGHBOURS)
 
     def close(self) -> None:
         """Writes the cloud, and what the report shows of it."""
         self._fuse_last()
         if self._cloud is None:
             raise InputError("no keyframe has a pose: track a longer sequence")
-        points = self._cloud.cloud(reconstruct.least_views(self._keyframes))
+        points = self._cloud.cloud(least_views(self._keyframes))
         write_cloud(self._path, points)
         write_dense_points(self._run / DENSE_NAME, points.points, points.sigma, points.colours)
 
     def _fuse_last(self) -> None:
         """Fuses the views that wait for others: none come, or from another place of the world."""
-        for number in range(max(len(self._views) - reconstruct.NEIGHBOURS, 0), len(self._views)):
+        for number in range(max(len(self._views) - NEIGHBOURS, 0), len(self._views)):
             self._fuse(number)
         self._views = []
 
@@ -82,8 +87,8 @@ class CloudSink:
         if self._views[number][0].tracks is None:
             return
         views = {k: (picture, view) for k, (_, picture, view) in enumerate(self._views)}
-        depth = reconstruct.fuse_keyframe(number, views, self._recorded(), self._rectifier)
-        self._cloud = self._cloud or VoxelCloud(reconstruct.default_voxel(depth, self._rectifier.rectified))
+        depth = fuse_keyframe(number, views, self._recorded(), self._rectifier)
+        self._cloud = self._cloud or VoxelCloud(default_voxel(depth, self._rectifier.rectified))
         points, sigma = depth.cloud(self._rectifier.rectified, self._cloud.size)
         self._cloud.add(points, sigma)
         if self._show is not None:

@@ -116,9 +116,9 @@ def read_run(folder: Path) -> RecordedRun:
         map=_read_map(folder / MAP_NAME),
         dense=read_dense_points(folder / DENSE_NAME) if (folder / DENSE_NAME).is_file() else None,
         pictures=read_pictures(folder / PICTURES_NAME) if (folder / PICTURES_NAME).is_file() else None,
-        entries=_read_json(folder / RUN_NAME, "track"),
-        evaluation=_read_json(folder / evaluated_frames.EVALUATION_NAME, "evaluate"),
-        refinement=_read_json(folder / REFINE_NAME, "refine"),
+        entries=read_table(folder / RUN_NAME, "track"),
+        evaluation=read_table(folder / evaluated_frames.EVALUATION_NAME, "evaluate"),
+        refinement=read_table(folder / REFINE_NAME, "refine"),
         evaluated=evaluated_frames.read_evaluated_frames(errors, count) if errors.is_file() else None,
         inertial=read_inertial_records(folder),
         pairs=read_frame_pairs(relative, count) if relative.is_file() else None,
@@ -174,6 +174,7 @@ def _read_map(path: Path) -> RecordedPoints | None:
     return RecordedPoints(points[kept], np.sqrt(np.maximum(largest, 0.0))[kept], colours)
 
 
-def _read_json(path: Path, command: str) -> dict[str, Any]:
+def read_table(path: Path, command: str) -> dict[str, Any]:
+    """What a command wrote beside a run; empty where it was not called, or wrote no table."""
     content = read_json(path, "the run", f"run `sigmaslam {command}` again") if path.is_file() else {}
     return content if isinstance(content, dict) else {}

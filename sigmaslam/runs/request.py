@@ -117,7 +117,7 @@ class OutputOptions:
             then that of the frames from its last keyframe on, and there is no trajectory after the fact.
         save_calibration: a calibration file, new, for what the run learns of its own.
     Raises:
-        InputError: there is a file of the name for the calibration.
+        InputError: there is a file of the name for the calibration, or none can be made.
     """
 
     out: Path
@@ -127,10 +127,11 @@ class OutputOptions:
     save_calibration: Path | None = None
 
     def __post_init__(self) -> None:
-        path = self.save_calibration
-        if path is not None and path.exists():
+        if (path := self.save_calibration) is None:
+            return
+        if path.exists():
             raise InputError(f"{path}: there is such a file: give --save-calibration another name")
-        if path is not None and (path.suffix.lower() not in (".yaml", ".yml") or not path.parent.is_dir()):
+        if path.suffix.lower() not in (".yaml", ".yml") or not (path.parent.is_dir() or path.parent == self.out):
             raise InputError(f"{path}: give --save-calibration a name that ends in .yaml, in a folder that is there")
 
 

@@ -90,6 +90,7 @@ class Scrutiny:
         ids, follows = self._window.landmarks.id[seen.landmark], self._localiser.follower.is_ready
         if self.timing.are_apart(frame, fit.pose, ids, seen.measurement, follows):
             doubts.add(Doubt.APART)
+            self._stands = False
         elif self._is_fixed(left, matches, fit):
             doubts.add(Doubt.FIXED)
         course = self._course

@@ -138,7 +138,7 @@ def prepare(out: Path, recipe: Recipe, truth: str) -> None:
         except (OSError, ValueError) as error:
             raise InputError(f"{scene} cannot be read ({error}); remove it or choose another --out") from error
         # Folders from before there were worlds of one's own, and inertial sensors, lack the keys.
-        there = {name: content.get(name) for name in asked}
+        there = {name: content.get(name, wish) for name, wish in asked.items()}
         there["recipe"] = {"world": None, "imu": None, **content.get("recipe", {})}
         if there != asked:
             raise InputError(f"{scene} was made with {there}, not {asked}; choose another --out")

@@ -77,8 +77,7 @@ class ScenePairs:
     ) -> None:
         if not domains:
             raise ValueError(f"there are no domains; give one or more of {', '.join(DOMAINS)}")
-        for domain in domains:
-            _generator(domain)  # not kept: a function of the user's file cannot be sent to another process
+        list(map(_generator, domains))  # not kept: a function of the user's file cannot be sent to another process
         if stereo and forward:
             raise ValueError("pairs are of one kind: give stereo or forward")
         self.seed, self.size, self.domains, self.stereo, self.forward = seed, size, domains, stereo, forward

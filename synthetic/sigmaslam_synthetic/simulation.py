@@ -206,7 +206,8 @@ def simulate(recipe: Recipe) -> Simulation:
     episode = generate(rngs[_WORLD], wish)
     start, end = episode.path.start, episode.path.end
     if len(episode.path.times) > 1 and (start > 0 or end < wish.duration - 1e-9):
-        raise InputError(f"{recipe.world}: its path is from {start:g} to {end:g} s, not from 0 to {wish.duration:g} s")
+        name = recipe.world or recipe.preset
+        raise InputError(f"{name}: its path is from {start:g} to {end:g} s, not from 0 to {wish.duration:g} s")
     axis = rngs[_ERRORS].standard_normal(3)
     turn = np.deg2rad(recipe.rotation_error) * axis / np.linalg.norm(axis)
     errors = Miscalibration(recipe.disparity_offset, rotation=(float(turn[0]), float(turn[1]), float(turn[2])))

@@ -68,7 +68,7 @@ def test_runs_at_the_same_times_in_two_places_are_doubted(tmp_path):
     poses = there.poses.copy()
     poses[:, :3, 3] = poses[::-1, [1, 2, 0], 3] ** 2
     write_tum(path, Trajectory(there.timestamps, poses))
-    assert "common times and hardly follows it: is it of another recording?" in _compare(tmp_path, "one", "two").words
+    assert "common times, but hardly follows it, as one of another recording." in _compare(tmp_path, "one", "two").words
 
 
 def test_each_run_has_its_lines_figures_and_settings(tmp_path):

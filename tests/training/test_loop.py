@@ -12,7 +12,6 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch import nn
 
 from sigmaslam.errors import InputError, SigmaSlamError
 from sigmaslam_models.network_export import load_network
@@ -90,9 +89,15 @@ def test_a_stopped_run_ends_as_one_that_was_not_stopped(finished, tiny, tmp_path
 
 @pytest.mark.long
 def test_a_loss_that_is_no_number_ends_the_run_and_keeps_its_checkpoint(tiny, tmp_path, monkeypatch):
-    no_number = {"name": "clip_grad_norm_", "value": lambda *others: torch.tensor(np.nan)}
-    in_step(2, lambda: monkeypatch.setattr(nn.utils, **no_number), monkeypatch)
-    with pytest.raises(SigmaSlamError, match="step 2: the loss is no finite number"):
+    pair_loss, calls = devices.pair_loss, []
+
+    def spoilt(*arguments):
+        calls.append(1)
+        loss = pair_loss(*arguments)
+        return loss if len(calls) <= 2 else loss._replace(descriptor=np.nan * loss.descriptor)
+
+    monkeypatch.setattr(devices, "pair_loss", spoilt)
+    with pytest.raises(SigmaSlamError, match="step 2: loss or gradient is not finite"):
         train(tmp_path, tiny, workers=0, recipe="quick")
     with safe_open(tmp_path / CHECKPOINT_NAME, framework="pt") as file:
         assert int(file.metadata()["step"]) == 2

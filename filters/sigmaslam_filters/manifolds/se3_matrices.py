@@ -73,12 +73,10 @@ def log_se3(transform: Tensor) -> Tensor:
     first, second, _ = _coefficients(squared)
     small = squared < _SMALL * _SMALL
     safe = torch.where(small, torch.ones_like(squared), squared)
-    inverse_term = torch.where(small, (1.0 + squared / 60.0) / 12.0, (1.0 - 0.5 * first / second) / safe)[
-        ..., None, None
-    ]
+    inverse_term = torch.where(small, (1.0 + squared / 60.0) / 12.0, (1.0 - 0.5 * first / second) / safe)
     K = skew(rotation)
     identity = torch.eye(3, dtype=R.dtype, device=R.device)
-    V_inverse = identity - 0.5 * K + inverse_term * (K @ K)
+    V_inverse = identity - 0.5 * K + inverse_term[..., None, None] * (K @ K)
     return torch.cat([(V_inverse @ t.unsqueeze(-1)).squeeze(-1), rotation], dim=-1)
 
 

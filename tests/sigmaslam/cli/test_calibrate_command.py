@@ -121,9 +121,9 @@ def test_boards_with_markers_calibrate_a_pair(tmp_path: Path, plan: Board, words
     assert camera.baseline == pytest.approx(np.linalg.norm(rig.T_left_right[:3, 3]), rel=2e-3)
     if isinstance(plan, AprilGrid):
         wrong = run_here("calibrate", tmp_path, "--board", "aprilgrid:4x3:0.05:0.2", "--out", out)
-        assert re.search(r"residuals of \d\.\d+ px are large .*is --board another one", wrong.stdout)
+        assert re.search(r"residuals of \d\.\d+ px .*another --board", wrong.stdout)
         turned = run_here("calibrate", tmp_path, "--board", "aprilgrid:3x4:0.05:0.3", "--out", out)
-        assert_refused(turned, "is --board another one")
+        assert_refused(turned, "another")
 
 
 @pytest.mark.long

@@ -10,6 +10,7 @@ import pytest
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers import open_sequence
 from sigmaslam.run_record.frame_table import read_frames
+from sigmaslam.runs.request import OutputOptions
 from sigmaslam_evaluation.run_evaluation import evaluate_run
 from tests.support.commands import assert_refused, run_here
 
@@ -47,6 +48,7 @@ def test_a_file_that_is_there_is_not_overwritten(demo_sequence: Path, tmp_path: 
     result = run_here("track", demo_sequence, "--out", tmp_path / "run", "--save-calibration", tmp_path / "old.yaml")
     assert_refused(result, "old.yaml", "another name")
     assert (tmp_path / "old.yaml").read_text() == "mine"
+    OutputOptions(tmp_path / "run", save_calibration=tmp_path / "run" / "new.yaml")  # a folder that the run makes
     for name in ("new.txt", "nowhere/new.yaml"):
         command = "track", demo_sequence, "--out", tmp_path / "run", "--save-calibration", tmp_path / name
         assert_refused(run_here(*command), name, "ends in .yaml, in a folder that is there")

@@ -72,6 +72,15 @@ def test_a_fault_is_doubted_and_no_pose_is_silently_wrong(demo: Demo, fault: str
     assert sum(each.status == "tracking" for each in estimates) > FRAMES // 2
 
 
+def test_images_delivered_again_are_doubtful_until_the_camera_moves(demo: Demo):
+    estimates, truth = driven(demo, "frozen_anew")
+    first = FRAMES // 3
+    frozen = range(first, first + 10)
+    assert all(Doubt.TIME in estimates[k].doubts for k in frozen)
+    assert max(squared_error(estimates[k], truth[k]) for k in frozen) < 2.0 * CHI_SQUARE_999[6]
+    assert all(each.status == "tracking" and not each.doubts for each in estimates[first + 13 :])
+
+
 def test_the_covariance_of_an_image_of_another_time_holds_the_pose_at_its_stamp(demo: Demo):
     """Velocity and stamp tell where the camera was; the image alone was up to 170 squared sigmas off in a room."""
     estimates, truth = driven(demo, "out_of_order")

@@ -158,7 +158,7 @@ class _Run:
         state.optimizer.zero_grad(set_to_none=True)
         (loss.descriptor + config.quality_weight * loss.quality + config.place_weight * loss.place).backward()
         if not nn.utils.clip_grad_norm_(state.network.parameters(), 1.0).isfinite():
-            raise SigmaSlamError(f"step {state.step}: the loss is no finite number: mend its source, then --resume")
+            raise SigmaSlamError(f"step {state.step}: loss or gradient is not finite: mend their source, then --resume")
         state.optimizer.step()
         state.schedule.step()
         state.step += 1
