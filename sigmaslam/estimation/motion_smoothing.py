@@ -8,8 +8,6 @@ from sigmaslam.estimation.constant_velocity import MotionState
 from sigmaslam.estimation.gaussian import matrix_root, regression
 from sigmaslam.geometry.se3 import nearest_rigid, se3_adjoint, se3_exp, se3_inverse, se3_log, skew
 
-_LINEAR = 0.3  # radians; turns of larger sigmas stay as predicted: the pass would swing, and its covariance grow
-
 
 @dataclass(frozen=True, slots=True)
 class MotionLink:
@@ -51,7 +49,7 @@ def smooth_motion(chain: list[MotionLink]) -> SmoothedMotion:
     for link, later in zip(chain[-2::-1], chain[:0:-1], strict=True):
         here, predicted, after = link.filtered, later.predicted, states[-1]
         ends = predicted.carried is None and len(here.twist) != len(predicted.twist)
-        ends |= np.trace(here.covariance[3:6, 3:6]) > _LINEAR**2
+        ends |= np.trace(here.covariance[3:6, 3:6]) > 0.3**2  # not linear: the pass would swing, its covariance grow
         if ends or not here.covariance.any():  # the inertial sensor died, or the keyframe, whose frame all are in
             states.append(here)
             continue

@@ -50,11 +50,11 @@ class Scrutiny:
         self._clock, self._course, self._moving = clock, course, moving
         # Places are all that is asked of it; a torn image leaves none in the next one.
         self._rival = MovingRegion(0.0, patience=0)
-        self._T_rival_fit = self._parting = np.eye(4)
+        self._T_rival_fit = self._parting = self._pose = np.eye(4)
         self._rival_covariance = np.zeros((6, 6))
         self._last_error, self._had_other_times = 0.0, False
-        # Frames since the camera stopped within one, if it did, and the covariance of the pose expected there.
-        self._stands, self._stopped_for, self._expected = False, 0, np.zeros((6, 6))
+        # The last pose; where the camera stopped within a frame, covariance of what was expected, twist, time before.
+        self._stop: tuple[np.ndarray, np.ndarray, np.ndarray, float] | None = None
         self._input_is_wrong = input_is_wrong
         self.timing = EyeTiming(self._window.camera.baseline)
         self._before: tuple[np.ndarray, ...] | None = None
@@ -90,7 +90,6 @@ class Scrutiny:
         ids, follows = self._window.landmarks.id[seen.landmark], self._localiser.follower.is_ready
         if self.timing.are_apart(frame, fit.pose, ids, seen.measurement, follows):
             doubts.add(Doubt.APART)
-            self._stands = False
         elif self._is_fixed(left, matches, fit):
             doubts.add(Doubt.FIXED)
         course = self._course
@@ -101,7 +100,7 @@ class Scrutiny:
             doubts.spread = doubts.spread + (_START_VARIANCE - 1.0) * fit.clustering * fit.relative
         if matches.rival is not None:
             doubts.add_motion(matches.rival, fit.pose)
-        self._doubt_prediction(doubts, fit)
+        self._doubt_prediction(doubts, matches, fit)
         if second is not None and not second.is_mover and not self._is_other(second, fit):
             # Nothing decides between the two as long as what asks for the other moves; they part on as they last did.
             T_rival_fit = second.pose @ se3_inverse(fit.pose)
@@ -115,7 +114,18 @@ class Scrutiny:
             doubts.add_motion(self._T_rival_fit @ fit.pose, fit.pose, self._rival_covariance)
         if doubts.prediction_is_wrong:
             fit = self._localiser.fit_again(matches, fit, Prediction.of(self._window, self._motion))
+        self._pose = fit.pose
         return matches, fit, doubts
+
+    def miss(self, is_skipped: bool) -> None:
+        """An image without a pose says nothing against a sensor's prediction; a new one, that what stopped did move."""
+        if dead_reckoning(self._motion) is not None:
+            self._motion.widen(1.0 / self._motion.widened)
+        if self._stop is not None and not is_skipped:
+            _, _, twist, since = self._stop
+            self._motion.set_twist(twist, np.abs(twist))
+            self._motion.doubt_time((self._course.timestamp or 0.0) - since)
+            self._stop = None
 
     def _leave_out(
         self, matches: GuidedMatches, second: SecondMotion, moving: MovingRegion
@@ -144,14 +154,13 @@ class Scrutiny:
         image, pose, old_ids, old_seen = self._before or (left, fit.pose, ids, seen)
         ways = seen_apart(self._window, rows, pose, fit.pose)
         moves = ways > 3.0 * ACCEPTANCE.stands
-        self._stands = 2 * (ways > ACCEPTANCE.stands).sum() < len(ways)
         if self._before is None or 2 * moves.sum() >= np.isfinite(ways).sum():
             _, now, then = np.intersect1d(ids, old_ids, assume_unique=True, return_indices=True)
             stays = moves[now] & (np.linalg.norm(seen[now] - old_seen[then], axis=1) < ACCEPTANCE.stands)
             is_fixed = (stays & fit.inliers[now]).sum() >= MIN_POINTS and 4 * stays.sum() < 3 * moves[now].sum()
             self._fixed_for = SPOILT if is_fixed else max(self._fixed_for - 1, 0)
             self._before = left, fit.pose, ids, seen
-        elif self._stands and shows_motion(image, left):
+        elif 2 * (ways > ACCEPTANCE.stands).sum() < len(ways) and shows_motion(image, left):
             return True
         return self._fixed_for > 0
 
@@ -162,7 +171,7 @@ class Scrutiny:
         prediction = Prediction.of(self._window, self._motion)
         return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
-    def _doubt_prediction(self, doubts: Doubts, fit: FrameFit) -> None:
+    def _doubt_prediction(self, doubts: Doubts, matches: GuidedMatches, fit: FrameFit) -> None:
         # What goes on is an acceleration: images out of order jump to and fro, and once some came others may.
         expects = self._had_other_times or self._last_error != 0.0
         error = time_error(self._motion, fit.step, self._clock.interval, expects)
@@ -170,7 +179,8 @@ class Scrutiny:
         excess = surprise(self._motion, fit.step)
         if is_other:
             self._motion.doubt_time(error * self._clock.interval)
-            self._expected, self._stopped_for = Prediction.of(self._window, self._motion).covariance, int(error < 0.0)
+            expected, now = Prediction.of(self._window, self._motion).covariance, self._course.timestamp or 0.0
+            self._stop = (self._pose, expected, self._motion.twist, now) if error < 0.0 else None
         elif excess > 1.0:
             self._motion.widen(excess)
         doubts.prediction_is_wrong = is_other or excess > 1.0
@@ -179,12 +189,15 @@ class Scrutiny:
             doubts.add(Doubt.TIME)
             # The pose at the stamp is the prediction, as uncertain as it was before, and the image's is off by a way.
             doubts.spread = doubts.spread + Prediction.of(self._window, self._motion).covariance
-        # An image that is delivered again, compressed anew, looks like a stop within a frame; so do those after it.
-        self._stopped_for += not is_other and self._stopped_for > 0
-        self._stopped_for *= self._stands
-        if self._stopped_for > 1:
-            doubts.add(Doubt.TIME)
-            doubts.spread = doubts.spread + self._stopped_for**2 * self._expected
+        if self._stop is not None and not is_other:
+            # An image that is delivered again, compressed anew, looks like a stop within a frame; so do those after it.
+            pose, expected, _, since = self._stop
+            if np.nanmedian(seen_apart(self._window, matches.views.landmark, pose, fit.pose)) < ACCEPTANCE.stands:
+                doubts.add(Doubt.TIME)
+                frames = 1.0 + ((self._course.timestamp or 0.0) - since) / self._clock.interval
+                doubts.spread = doubts.spread + frames**2 * expected
+            else:
+                self._stop = None
         self._last_error = error
 
 

@@ -13,7 +13,6 @@ from threadpoolctl import ThreadpoolController
 from sigmaslam.estimation.build_motion import build_motion
 from sigmaslam.estimation.calibration_errors import ERRORS, TURNS, CalibrationPrior
 from sigmaslam.estimation.clustered_errors import SharedErrors
-from sigmaslam.estimation.constant_velocity import dead_reckoning
 from sigmaslam.estimation.estimator_graphs import EstimatorGraphs
 from sigmaslam.estimation.frame_clock import FrameClock
 from sigmaslam.estimation.frame_fit import FrameFit
@@ -202,9 +201,8 @@ class StereoTracker:
             matches, fit, change = by_times(self._localiser, partial(self._localise, frame, timestamp, clock, doubts))
         is_skipped |= change is not None and not self._course.is_shifted
         self._course.is_shifted = change is not None and is_skipped
-        if fit is None and dead_reckoning(self._motion) is not None:
-            # Images that give no pose say nothing against the prediction either.
-            self._motion.widen(1.0 / self._motion.widened)
+        if fit is None:
+            self._scrutiny.miss(is_skipped)
         seen = frame.left, frame.right, self._window.landmarks.id[matches.views.landmark], matches
         self.last_frame = MatchedFrame(*seen, None if fit is None else fit.inliers, frame.usable)
         predicted = filtered = self._motion.state
