@@ -6,12 +6,11 @@ from typing import Annotated
 import typer
 
 from sigmaslam.cli.run_summary import tell_summary
-from sigmaslam.errors import InputError
 
 
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Run folder of `sigmaslam track`, or up to six.")],
-    out: Annotated[Path | None, typer.Option(help="Page of several runs, comparison.html unless given.")] = None,
+    out: Annotated[Path, typer.Option(help="Page that compares several runs.")] = Path("comparison.html"),
 ) -> None:
     """Make report.html of a run anew, or one page that compares several runs.
 
@@ -22,11 +21,9 @@ def report(
     from sigmaslam.runs.finish import finish_run
     from sigmaslam_evaluation.comparison import write_comparison
 
-    if out is not None and len(runs) == 1:
-        raise InputError(f"--out {out}: is of several runs; the report of one is report.html in its folder")
     finished = [(run, finish_run(run)) for run in runs]
     if len(runs) > 1:
-        typer.echo(f"Report: {write_comparison(runs, out or Path('comparison.html'))}")
+        typer.echo(f"Report: {write_comparison(runs, out)}")
     for run, summary in finished:
         if summary is not None:
             tell_summary(summary, run)

@@ -155,12 +155,10 @@ class CameraModel:
 
 
 def _check_numbers(values: Any, name: str) -> None:
-    if not isinstance(values, Sequence | np.ndarray) or not all(_is_number(value) for value in values):
+    kinds = int | float | np.integer | np.floating
+    ok = isinstance(values, Sequence | np.ndarray) and all(isinstance(v, kinds) and type(v) is not bool for v in values)
+    if not ok:
         raise CalibrationError(f"{name} must be numbers, got {shorten(repr(values))}")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def _as_float64(array: np.ndarray, last: int, name: str) -> tuple[np.ndarray, np.dtype]:

@@ -182,9 +182,3 @@ def test_the_command_writes_a_page_of_several_runs(tmp_path):
     assert "Runs compared: one, two" in Page(page.read_text(encoding="utf-8")).words
     assert not (tmp_path / "one/report.html").exists()
     assert_refused(run_here("report", tmp_path / "one", tmp_path / "three"), "three: holds no run.json and frames.csv")
-
-
-def test_a_page_of_one_run_has_its_own_place(tmp_path):
-    make_run(tmp_path / "one", 20, points=50)
-    refused = run_here("report", tmp_path / "one", "--out", tmp_path / "x.html")
-    assert_refused(refused, "x.html", "the report of one is report.html in its folder")
