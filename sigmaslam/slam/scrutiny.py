@@ -117,14 +117,14 @@ class Scrutiny:
         self._pose = fit.pose
         return matches, fit, doubts
 
-    def miss(self, is_skipped: bool) -> None:
-        """An image without a pose says nothing against a sensor's prediction; a new one, that what stopped did move."""
+    def miss(self, timestamp: float, shows: bool) -> None:
+        """An image without a pose says nothing against a sensor's prediction; if it `shows` a place, nor for a stop."""
         if dead_reckoning(self._motion) is not None:
             self._motion.widen(1.0 / self._motion.widened)
-        if self._stop is not None and not is_skipped:
+        elif self._stop is not None and shows:
             _, _, twist, since = self._stop
-            self._motion.set_twist(twist, np.abs(twist))
-            self._motion.doubt_time((self._course.timestamp or 0.0) - since)
+            self._motion.set_twist(twist, np.repeat(np.linalg.norm(twist.reshape(2, 3), axis=1), 3))
+            self._motion.predict(timestamp - since, self._localiser.config.densities(self._window.depth))
             self._stop = None
 
     def _leave_out(
@@ -179,8 +179,8 @@ class Scrutiny:
         excess = surprise(self._motion, fit.step)
         if is_other:
             self._motion.doubt_time(error * self._clock.interval)
-            expected, now = Prediction.of(self._window, self._motion).covariance, self._course.timestamp or 0.0
-            self._stop = (self._pose, expected, self._motion.twist, now) if error < 0.0 else None
+            expected = Prediction.of(self._window, self._motion).covariance
+            self._stop = (self._pose, expected, self._motion.twist, self._course.tracked_at) if error < 0.0 else None
         elif excess > 1.0:
             self._motion.widen(excess)
         doubts.prediction_is_wrong = is_other or excess > 1.0
@@ -194,7 +194,7 @@ class Scrutiny:
             pose, expected, _, since = self._stop
             if np.nanmedian(seen_apart(self._window, matches.views.landmark, pose, fit.pose)) < ACCEPTANCE.stands:
                 doubts.add(Doubt.TIME)
-                frames = 1.0 + ((self._course.timestamp or 0.0) - since) / self._clock.interval
+                frames = 1.0 + (self._course.tracked_at - since) / self._clock.interval
                 doubts.spread = doubts.spread + frames**2 * expected
             else:
                 self._stop = None

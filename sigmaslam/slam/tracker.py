@@ -202,7 +202,8 @@ class StereoTracker:
         is_skipped |= change is not None and not self._course.is_shifted
         self._course.is_shifted = change is not None and is_skipped
         if fit is None:
-            self._scrutiny.miss(is_skipped)
+            shows = not is_skipped and change is None and self._relocaliser.is_enough(frame.view)
+            self._scrutiny.miss(timestamp, shows)
         seen = frame.left, frame.right, self._window.landmarks.id[matches.views.landmark], matches
         self.last_frame = MatchedFrame(*seen, None if fit is None else fit.inliers, frame.usable)
         predicted = filtered = self._motion.state

@@ -81,6 +81,24 @@ def test_images_delivered_again_are_doubtful_until_the_camera_moves(demo: Demo):
     assert all(each.status == "tracking" and not each.doubts for each in estimates[first + 13 :])
 
 
+def test_a_stop_before_a_covered_lens_is_one(demo: Demo):
+    """Black images say nothing of it: the camera stays where it stood, and is found there."""
+    camera, frames, _ = demo
+    rng, step, stop = np.random.default_rng(3), frames[1].timestamp - frames[0].timestamp, frames[12]
+    tracker, found = StereoTracker(camera), []
+    for k in range(28):
+        shown = frames[k] if k < 12 else stop
+        left, right = (noisy(each, 2.0, rng) if k >= 12 else each for each in (shown.left, shown.right))
+        if 18 <= k < 22:
+            left, right = noisy(0 * left, 1.5, rng), noisy(0 * right, 1.5, rng)
+        found.append(tracker.step(left, right, frames[0].timestamp + k * step))
+    assert Doubt.TIME in found[16].doubts
+    assert {each.status for each in found[18:22]} == {"lost"}
+    places = np.array([each.T_world_camera[:3, 3] for each in found])
+    assert np.linalg.norm(places[18:] - places[17], axis=1).max() < 0.03
+    assert all(each.status in ("tracking", "doubtful", "relocalised") for each in found[22:])
+
+
 def test_the_covariance_of_an_image_of_another_time_holds_the_pose_at_its_stamp(demo: Demo):
     """Velocity and stamp tell where the camera was; the image alone was up to 170 squared sigmas off in a room."""
     estimates, truth = driven(demo, "out_of_order")
