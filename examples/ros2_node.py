@@ -142,7 +142,8 @@ class SigmaSlamNode(Node):
         super().__init__("sigmaslam")
         self._given = {name: self.declare_parameter(name, default).value for name, default in PARAMETERS.items()}
         self._topics = [self.resolve_topic_name(self._given[eye]) for eye in ("left", "right")]
-        self._info_topics = [self._find_info_topic(self._given[eye]) for eye in ("left", "right")]
+        infos = [self._find_info_topic(self._given[eye]) for eye in ("left", "right")]
+        self._info_topics = [self.resolve_topic_name(topic) for topic in infos]
         self.failure: Exception | None = None
         self._infos: list[CameraInfo | None] = [None, None]
         self._heard, self._dropped, self._late, self._heard_at = [0, 0], 0, 0, time.monotonic()
@@ -161,7 +162,7 @@ class SigmaSlamNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         given = [self._given[eye] for eye in ("left", "right")]  # a name that is resolved would be remapped again
         eyes = [Subscriber(self, Image, topic, qos_profile=qos_profile_sensor_data) for topic in given]
-        for eye, topic in enumerate(self._info_topics):
+        for eye, topic in enumerate(infos):
             self.create_subscription(CameraInfo, topic, partial(self._take_info, eye), qos_profile_sensor_data)
             eyes[eye].registerCallback(partial(self._count, eye))
         self._pairs = ApproximateTimeSynchronizer(eyes, 10, self._given["slop"] + 1e-9)  # which takes what is below

@@ -117,7 +117,7 @@ def _place(run: RecordedRun, first: RecordedRun) -> _Placed:
     evaluated = None if run.evaluated is None else replace(run.evaluated, truth=best.apply(run.evaluated.truth))
     note = f"is aligned to the first run by {'the truth' if by_truth else 'the paths'} at {known.sum()} common times"
     extent, variances = np.ptp(first.trajectory.positions[others], axis=0), run.covariances[rows, :3, :3]
-    sigma = np.sqrt(np.mean(np.trace(variances, axis1=1, axis2=2)))
+    sigma = np.sqrt(np.median(np.trace(variances, axis1=1, axis2=2)))
     if not by_truth and np.sqrt(np.mean(distance**2)) > max(_OTHER * float(np.linalg.norm(extent)), 4.0 * sigma):
         note += ", but hardly follows it, as one of another recording"
     run = replace(run, trajectory=moved, evaluated=evaluated)

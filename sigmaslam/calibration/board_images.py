@@ -62,11 +62,11 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
             continue
         kinds = [_moments(told, kind) for kind in range(len(told[0][1].moments))]
         moments = max(kinds, key=lambda each: sum(map(all, each.values())))
-        is_paired = any(map(all, moments.values()))
+        pairs = sum(map(all, moments.values()))
         if len(told) < len(files):
-            untold += [file for file in files if is_paired and tell(file) is None]
+            untold += [file for file in files if 2 * pairs > 2 and len(files) <= 4 * pairs and tell(file) is None]
             continue
-        if is_paired:
+        if pairs:
             # 2 comes before 10.
             order = sorted(moments, key=lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), name))
             return [

@@ -276,9 +276,7 @@ def _solve_without_outliers(rig: Rig, corners: Corners) -> tuple[BoardBundle, Co
         if wrong.any():
             for image, size in zip(numbers[wrong].tolist(), sizes[wrong].tolist(), strict=True):
                 times = size / np.median(sizes)
-                refused.append(
-                    (image, f"a quarter of its corners are {size:.2f} px off or more, {times:.1f} times as usual")
-                )
+                refused.append((image, f"a quarter of its corners are {size:.2f} px off, {times:.1f} times the usual"))
             dropped |= np.isin(all_corners.image, numbers[wrong])
             continue
         limit = OUTLIER_CORNER * float(np.sqrt(np.median(squared))) / _MEDIAN_DISTANCE

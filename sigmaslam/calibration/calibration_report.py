@@ -153,7 +153,7 @@ def _doubts(result: BoardCalibration) -> list[str]:
         if coverage(result, k) < _COVERED:
             doubts.append(f"{name}: large parts of the image show no board, the lens is extrapolated: move it there")
         if folds(eye):
-            doubts.append(f"{name}: the lens folds before the corners: show the board there, or try another --lens")
+            doubts.append(f"{name}: the lens folds before the image's corners: show the board there, or try another")
         if eye.distortion_model == "radtan" and len(eye.distortion) > 4:
             last = len(eye.distortion) - 1
             sigma = float(result.sigmas[result.rig.names.index(f"{name}.d{last}")])

@@ -131,7 +131,8 @@ class OutputOptions:
             return
         if path.exists():
             raise InputError(f"{path}: there is such a file: give --save-calibration another name")
-        if path.suffix.lower() not in (".yaml", ".yml") or not (path.parent.is_dir() or path.parent == self.out):
+        is_there = path.parent.is_dir() or path.parent.resolve() == self.out.resolve()
+        if path.suffix.lower() not in (".yaml", ".yml") or not is_there:
             raise InputError(f"{path}: give --save-calibration a name that ends in .yaml, in a folder that is there")
 
 

@@ -330,7 +330,7 @@ def test_what_is_remapped_is_heard_by_its_own_name(start: Callable[..., Any], mo
     monkeypatch.setattr(StubNode, "remapped", {"left/image_raw": "/cam/l/image_rect", "right/camera_info": "/info"})
     node = start()
     assert node._topics == ["/cam/l/image_rect", "right/image_raw"]
-    assert node._info_topics == ["/cam/l/camera_info", "right/camera_info"]
+    assert node._info_topics == ["/cam/l/camera_info", "/info"]
     assert {*node.subscribers} == {"left/image_raw", "right/image_raw", "/cam/l/camera_info", "right/camera_info"}
 
 

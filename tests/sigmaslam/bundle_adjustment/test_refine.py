@@ -230,7 +230,7 @@ def test_the_command_writes_what_evaluate_reads(run_folder: Path, tmp_path: Path
 
 
 def test_errors_that_the_run_found_in_the_pair_are_taken_out(run_folder: Path, tmp_path: Path):
-    """KITTI's pairs are turned by 0.08 degrees: a drive was refined from 0.25 to 0.31 m, now to 0.23."""
+    """The run finds a drive's pair turned by 0.08 degrees: it was refined from 0.25 to 0.31 m, now to 0.23."""
     turned = shutil.copytree(run_folder, tmp_path / "turned")
     with np.load(turned / TRACKS_NAME) as archive:
         arrays = dict(archive)

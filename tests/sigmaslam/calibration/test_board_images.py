@@ -63,6 +63,9 @@ def test_an_image_beside_those_of_two_eyes_is_named(tmp_path: Path):
     written(tmp_path, *(f"{eye}/{k}.png" for eye in ("left", "right") for k in (1, 2)), "debug/drawn.png")
     with pytest.raises(InputError, match=r"debug/drawn\.png: its name tells no eye"):
         find_board_images([tmp_path])
+    for name in ("img_{}", "cam{}"):  # of which 0 and 1 look like a pair
+        series = written(tmp_path / name, *(f"{name}.png".format(k) for k in range(12)))
+        assert [len(moment.files) for moment in find_board_images([series])] == [1] * 12
 
 
 def test_two_folders_of_equal_length_whose_eyes_no_name_tells_are_refused(tmp_path: Path):
