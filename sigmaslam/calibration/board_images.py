@@ -57,14 +57,15 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
     alone: list[list[Path]] = []
     untold: list[Path] = []
     for tell in eye_tellers():
-        told = [(file, name) for file in files if (name := tell(file)) is not None]
+        names = [(file, tell(file)) for file in files]
+        told = [(file, name) for file, name in names if name is not None]
         if len({name.eye for _, name in told}) < 2:
             continue
         kinds = [_moments(told, kind) for kind in range(len(told[0][1].moments))]
         moments = max(kinds, key=lambda each: sum(map(all, each.values())))
         pairs = sum(map(all, moments.values()))
         if len(told) < len(files):
-            untold += [file for file in files if 2 * pairs > 2 and len(files) <= 4 * pairs and tell(file) is None]
+            untold += [file for file, name in names if 2 * pairs > 2 and len(files) <= 4 * pairs and name is None]
             continue
         if pairs:
             # 2 comes before 10.

@@ -10,7 +10,7 @@ from sigmaslam.cli.run_summary import tell_summary
 
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Run folder of `sigmaslam track`, or up to six.")],
-    out: Annotated[Path, typer.Option(help="Page that compares several runs.")] = Path("comparison.html"),
+    out: Annotated[Path | None, typer.Option(help="Page; RUN/report.html, of several comparison.html.")] = None,
 ) -> None:
     """Make report.html of a run anew, or one page that compares several runs.
 
@@ -23,9 +23,9 @@ def report(
 
     finished = [(run, finish_run(run)) for run in runs]
     if len(runs) > 1:
-        typer.echo(f"Report: {write_comparison(runs, out)}")
+        typer.echo(f"Report: {write_comparison(runs, out or Path('comparison.html'))}")
+    elif out is not None or finished[0][1] is None:
+        typer.echo(f"Report: {write_report(runs[0], out)}")
     for run, summary in finished:
         if summary is not None:
             tell_summary(summary, run)
-        elif len(runs) == 1:
-            typer.echo(f"Report: {write_report(run)}")

@@ -47,8 +47,8 @@ _LINKED = (
 )
 
 
-def write_report(run_dir: str | Path) -> Path:
-    """Write `report.html` from the files of a run folder, those of `evaluate` and `refine` included.
+def write_report(run_dir: str | Path, out: Path | None = None) -> Path:
+    """Write a page, `report.html` if not `out`, from a run folder's files, those of `evaluate` and `refine` included.
 
     Returns:
         The path of the report.
@@ -67,7 +67,7 @@ def write_report(run_dir: str | Path) -> Path:
         "picture_magnification": PICTURE_MAGNIFICATION,
     }
     return write_page(
-        folder / REPORT_NAME,
+        out or folder / REPORT_NAME,
         "report.html",
         [run.frames.seconds],
         build_plots(run),
@@ -90,7 +90,7 @@ def write_report(run_dir: str | Path) -> Path:
         nees_verdict=run.evaluation.get("nees_verdict"),
         refinement=report_facts.list_refinement(run),
         machine=report_facts.list_machine(run),
-        links=[(name, words) for name, words in _LINKED if (folder / name).is_file()],
+        links=[(name, words) for name, words in _LINKED if out is None and (folder / name).is_file()],
         configuration=_configuration(run.entries),
     )
 

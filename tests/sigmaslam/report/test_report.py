@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sigmaslam.cli.report import report
 from sigmaslam.errors import InputError
 from sigmaslam.files import save_arrays
 from sigmaslam.readers.trajectory_files import read_tum
@@ -48,6 +49,13 @@ def test_report_is_one_file_that_needs_no_other(tmp_path, count):
         "Time spent [ms]",
         "Belief",
     ]
+
+
+def test_page_of_a_run_may_stand_elsewhere_without_links_to_its_files(tmp_path):
+    make_run(tmp_path / "run")
+    report([tmp_path / "run"], tmp_path / "page.html")
+    assert all(link.startswith("data:") for link in Page((tmp_path / "page.html").read_text(encoding="utf-8")).links)
+    assert not (tmp_path / "run/report.html").exists()
 
 
 def test_report_says_what_the_run_was(tmp_path):
