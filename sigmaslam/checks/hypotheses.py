@@ -46,8 +46,7 @@ def stand_upright(matches: EyeMatches) -> EyeMatches:
 
 
 def _rectified(pixels: np.ndarray, model: CameraModel, R: np.ndarray, view: RectifiedStereo) -> np.ndarray:
-    rays = model.unproject(pixels) @ R.T
-    return view.project(rays)[:, :2]
+    return view.project(model.unproject(pixels) @ R.T)[:, :2]
 
 
 def _finite(matches: EyeMatches) -> EyeMatches:

@@ -170,7 +170,7 @@ def _match_and_doubt(
     with confidence, a little beside themselves.
     """
     image0, image1, features0, features1 = pair
-    matches = match_twice(estimator, *pair, min_probability)
+    matches = match_twice(estimator, *pair, min(min_probability, MIN_PROBABILITY))
     probable = matches.probability >= MIN_PROBABILITY
     count, probability = int(probable.sum()), matches.probability
     if count >= _BELIEVED:

@@ -61,11 +61,11 @@ class CameraModel:
         _check_numbers((self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.skew), "width to skew")
         _check_numbers(self.distortion, "distortion")
         object.__setattr__(self, "distortion", tuple(float(value) for value in self.distortion))
-        if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
-            raise CalibrationError(
-                f"image size is {self.width:.6g}x{self.height:.6g}; width and height must be positive, and at most "
-                f"{MAX_SIDE}"
-            )
+        if not all(0 < side <= MAX_SIDE and side % 1 == 0 for side in (self.width, self.height)):
+            size = f"{self.width:.6g}x{self.height:.6g}"
+            raise CalibrationError(f"image size is {size}; sides must be whole numbers from 1, and at most {MAX_SIDE}")
+        for name in ("width", "height", "fx", "fy", "cx", "cy", "skew"):  # those of numpy are none of YAML
+            object.__setattr__(self, name, (int if name in ("width", "height") else float)(getattr(self, name)))
         numbers = (self.fx, self.fy, self.cx, self.cy, self.skew, *self.distortion)
         if not np.all(np.isfinite(numbers)):
             raise CalibrationError(f"fx, fy, cx, cy, skew, distortion must be finite numbers, got {numbers}")
@@ -143,8 +143,7 @@ class CameraModel:
         X, Y, Z = points[..., 0], points[..., 1], points[..., 2]
         if self.distortion_model == "equidistant":
             radius = np.hypot(X, Y)
-            theta = np.arctan2(radius, Z)
-            theta_d, _ = _equidistant_polynomial(theta, self.distortion)
+            theta_d, _ = _equidistant_polynomial(np.arctan2(radius, Z), self.distortion)
             # The ratio is 0 / 0 on the axis; its limit is 1 / Z.
             scale = np.where(radius > 0, theta_d / radius, 1.0 / Z)
             return X * scale, Y * scale

@@ -152,8 +152,8 @@ class UdpStream:
     def __init__(self, host: str, port: int) -> None:
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        except OSError as error:
-            raise InputError(f"--stream udp://{host}:{port}: {error.strerror}; name a host that there is") from None
+        except (OSError, UnicodeError) as error:
+            raise InputError(f"--stream udp://{host}:{port}: {error}; name a host that there is") from None
         self._address: Any = address  # its form is the family's
         self._socket = socket.socket(family, kind, protocol)
         self._socket.setblocking(False)

@@ -1,7 +1,7 @@
 """Filtering images from disk, one by one or as a sequence, and both eyes of a run."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from sigmaslam.files import atomic_write_bytes, check_new_folder, make_folder
 from sigmaslam.image_filtering import NoiseModel, SequenceFilter, denoise_image, estimate_noise, filter_both_ways
 from sigmaslam.progress import counted
 from sigmaslam.readers import StereoFrame
-from sigmaslam.readers.images import IMAGE_SUFFIXES, read_grey
+from sigmaslam.readers.images import IMAGE_SUFFIXES, GreyConverter, read_grey, read_image
 from sigmaslam.readers.pairing import list_images
 from sigmaslam.readers.video import read_frames
 
@@ -115,17 +115,17 @@ _Results = Iterator[tuple[str, NoiseModel | None, np.ndarray]]
 
 def _filter_alone(source: Path, noise: NoiseModel | None, thorough: bool, blur: float) -> _Results:
     """Names, noise and estimates."""
-    for name, image in _read(source):
+    for name, image in _read(source, read_grey):
         own = replace(noise or estimate_noise(image), blur=blur)
         yield name, own, denoise_image(image, own, thorough)
 
 
 def _filter_sequence(source: Path, noise: NoiseModel | None) -> _Results:
     """Likewise, each from those before and after it."""
-    names, forward = [], SequenceFilter(noise)
+    names, forward, grey = [], SequenceFilter(noise), GreyConverter()
 
     def images() -> Iterator[np.ndarray]:
-        for name, image in _read(source):
+        for name, image in _read(source, lambda path: grey.convert(read_image(path), str(path))):
             names.append(name)
             yield image
 
@@ -134,11 +134,10 @@ def _filter_sequence(source: Path, noise: NoiseModel | None) -> _Results:
             yield names[number], forward.noise, result
 
 
-def _read(source: Path) -> Iterator[tuple[str, np.ndarray]]:
+def _read(source: Path, read: Callable[[Path], np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
     """Names and grey images, large enough to filter."""
     if source.is_dir() or _is_image(source):
-        paths = list_images(source) if source.is_dir() else [source]
-        images = ((path.name, read_grey(path)) for path in paths)
+        images = ((path.name, read(path)) for path in (list_images(source) if source.is_dir() else [source]))
     else:
         images = ((f"{index:06d}.png", image) for index, image in enumerate(read_frames(source)))
     for name, image in images:

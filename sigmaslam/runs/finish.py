@@ -27,8 +27,7 @@ def finish_run(run: Path) -> dict[str, Any] | None:
         OutputError: a file could not be written.
     """
     partial = run / PARTIAL_POSES
-    described = (run / RUN_NAME).is_file() and (run / FRAMES_NAME).is_file()
-    if not described:
+    if not ((run / RUN_NAME).is_file() and (run / FRAMES_NAME).is_file()):
         raise InputError(f"{run}: holds no {RUN_NAME} and {FRAMES_NAME}; give a folder written by `sigmaslam track`")
     if not (partial.is_file() and (run / PARTIAL_RELATIVE_POSES).is_file()):
         return None

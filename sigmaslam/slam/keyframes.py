@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from sigmaslam.errors import InputError
 from sigmaslam.estimation.acceptance import ACCEPTANCE
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
@@ -151,8 +152,10 @@ class Keyframes:
         """Remembers the keyframes of a map, before there are others.
 
         Raises:
-            InputError: the file is no map, or made with another front-end or camera.
+            InputError: the file is no map, or made with another front-end or camera, or there are others.
         """
+        if self.remembered or self.active:
+            raise InputError(f"{path}: a tracker takes one map, before its first keyframe: make another tracker")
         keyframes, past, hanging = read_keyframes(path, frontend, camera)
         self._window.restart(past)
         for each in hanging:

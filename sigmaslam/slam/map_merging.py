@@ -155,7 +155,7 @@ def _find(one: MapFile, other: MapFile) -> Found:
     for first, second in itertools.combinations(links, 2):
         if _agree(one, other, first, second):
             return first
-    raise InputError(f"{other.path}: {len(links)} of {len(other.known)} keyframes are found, and no two agree")
+    raise InputError(f"{other.path}: {len(links)} of {len(other.known)} keyframes are found, and two must agree")
 
 
 def _agree(one: MapFile, other: MapFile, first: Found, second: Found) -> bool:

@@ -23,8 +23,7 @@ def retrieve(
         appearance: of these, and perhaps of others.
     """
     latest_first = most_alike(view, among, appearance)[::-1]
-    order = np.argsort(-count_votes(view, latest_first), kind="stable")
-    return [latest_first[k] for k in order[:count]]
+    return [latest_first[k] for k in np.argsort(-count_votes(view, latest_first), kind="stable")[:count]]
 
 
 def most_alike(view: StereoView, among: list[KnownKeyframe], appearance: AppearanceIndex) -> list[KnownKeyframe]:

@@ -82,7 +82,7 @@ class StereoTracker:
 
     Attributes:
         rectifier: of the images that are tracked.
-        last_frame: what the last frame saw, for pictures; None before the first.
+        last_frame: what the last frame saw, for pictures, to be copied before one draws; None before the first.
     Raises:
         InputError: an argument is of another type, or there is no such front-end or backend, the provider is not
             installed, or the folder of weights holds no network of the front-end, or one that does not fit.
@@ -109,9 +109,7 @@ class StereoTracker:
         networks = config.max_keypoints, backend, threads, provider, weights
         load: Callable[[], Frontend] = partial(build_frontend, frontend, *networks)
         if threads > 1:  # beside all else that a start needs
-            beside = ThreadPoolExecutor(1, "loading")
-            load = beside.submit(load).result
-            beside.shutdown(wait=False)
+            load = ThreadPoolExecutor(1, "loading").submit(load).result
         self.rectifier = StereoRectifier(camera)
         self._camera, turned = (rectified := self.rectifier.rectified), self.rectifier.T_rectified_left
         self._blas = ThreadpoolController()
@@ -146,7 +144,7 @@ class StereoTracker:
         """Takes the world of a map that `sigmaslam track` has written; tracking starts where a view is found in it.
 
         Raises:
-            InputError: the file is no map, or made with another front-end or camera.
+            InputError: the file is no map, or of another front-end or camera, or the tracker has keyframes.
         """
         self._keyframes.load(Path(path), self._frontend.name, self._camera)
         self._course.phase = Phase.WAITING_IN_MAP
@@ -246,15 +244,18 @@ class StereoTracker:
 
     def map(self) -> PointMap:
         """All landmarks so far that were seen at least three times."""
-        return self._keyframes.map().transform(se3_inverse(self.rectifier.T_rectified_left))
+        with self._turn:
+            return self._keyframes.map().transform(se3_inverse(self.rectifier.T_rectified_left))
 
     def final_trajectory(self) -> tuple[Trajectory, np.ndarray]:
         """All frames with a pose so far as they are known now, with covariances (N, 6, 6) in the camera's own frame."""
-        return self._history.final()
+        with self._turn:
+            return self._history.final()
 
     def pack_keyframes(self) -> dict[str, Any]:
         """Keyframes by which a later run finds its place in the map, as arrays by name."""
-        return {TURN: self.rectifier.T_rectified_left, **self._keyframes.pack(self._frontend.name, self._camera)}
+        with self._turn:
+            return {TURN: self.rectifier.T_rectified_left, **self._keyframes.pack(self._frontend.name, self._camera)}
 
     def _localise(
         self, frame: Frame, timestamp: float, clock: Stopwatch, doubts: Doubts

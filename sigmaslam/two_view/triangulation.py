@@ -109,6 +109,7 @@ def triangulate_optimal(views: TwoViews, pixels: np.ndarray, covariance: np.ndar
         expected, J = _project_inverse_depth(views, state)
         weighted = np.swapaxes(J, -1, -2) @ weight
         normal = weighted @ J
+        normal += 1e-12 * np.trace(normal, axis1=-2, axis2=-1)[..., None, None] * np.eye(3)  # of a pair that diverges
         step = np.linalg.solve(normal, weighted @ (pixels - expected)[..., None])[..., 0]
         state = state + np.where(np.isfinite(step), step, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):

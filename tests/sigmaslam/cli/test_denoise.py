@@ -47,6 +47,19 @@ def test_the_images_of_a_folder_lose_most_of_their_noise(noisy_pairs: Path, tmp_
         assert rmse(path, DEMO / "image_0" / path.name) < 0.5 * SIGMA
 
 
+def test_a_bright_spot_in_16_bits_changes_no_other_pixel(tmp_path: Path):
+    """2,100 is beyond eleven bits, which hold the rest of the sequence."""
+    folder = tmp_path / "deep"
+    folder.mkdir()
+    for k in range(4):
+        image = np.random.default_rng(k).normal(1000.0, 30.0, (120, 160))
+        image[:6, :6] = 2100.0 if k == 2 else 1000.0
+        cv2.imwrite(str(folder / f"{k}.png"), image.astype(np.uint16))
+    assert run_here("images", "denoise", folder, "--out", tmp_path / "out").returncode == 0
+    means = [cv2.imread(str(path), 0)[20:].mean() for path in sorted((tmp_path / "out").iterdir())]
+    assert means == pytest.approx([1000.0 * 255 / 2047] * 4, rel=0.02)
+
+
 def test_a_video_becomes_images(tmp_path: Path):
     video = cv2.VideoWriter(str(tmp_path / "one.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48), isColor=False)
     for k in range(3):

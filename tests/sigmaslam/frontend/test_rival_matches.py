@@ -1,6 +1,7 @@
 """Matches are not believed where others agree as well: scenes that repeat themselves, images upside down."""
 
 import logging
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +11,8 @@ import sigmaslam
 from sigmaslam.frontend.rival_matches import count_rivals, share_with_rivals
 from sigmaslam.frontend.types import Features
 from sigmaslam_synthetic.rendering.textures import dead_leaves
+
+DEMO = Path(__file__).resolve().parents[3] / "synthetic/sigmaslam_synthetic/demo/image_0"
 
 
 def features(keypoints: np.ndarray, descriptors: np.ndarray) -> Features:
@@ -54,6 +57,15 @@ def test_a_checkerboard_moved_by_two_squares_claims_nothing(frontend: str, caplo
     assert (everything.probability < 0.5).all()
     assert (np.diff(everything.probability) <= 0.0).all()
     assert "repeats itself" in caplog.text
+
+
+@pytest.mark.long
+def test_who_asks_for_certain_matches_alone_hears_of_nothing_upside_down(caplog: pytest.LogCaptureFixture):
+    pair = [cv2.imread(str(DEMO / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE) for frame in (0, 20)]
+    with caplog.at_level(logging.WARNING):
+        found = sigmaslam.match_images(*pair, min_probability=1.0)
+    assert (found.probability >= 1.0).all()
+    assert "upside down" not in caplog.text
 
 
 @pytest.mark.long

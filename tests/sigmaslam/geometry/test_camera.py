@@ -36,6 +36,15 @@ def points_in_view(count=500, spread=0.7):
     return np.c_[xy, np.ones(count)] * rng.uniform(0.5, 50, (count, 1))
 
 
+def test_numbers_of_numpy_are_python_s_own_and_sides_whole():
+    """A calibration in numpy is written, and rectified, as any other."""
+    camera = make_camera(width=np.int64(752), height=480.0, fx=np.float64(458.654), fy=np.float32(457.5))
+    assert {type(each) for each in (camera.width, camera.height)} == {int}
+    assert {type(each) for each in (camera.fx, camera.fy, camera.cx, camera.cy, camera.skew)} == {float}
+    with pytest.raises(CalibrationError, match="whole numbers"):
+        make_camera(width=752.5)
+
+
 @pytest.mark.parametrize("coefficients", [RADTAN4, RADTAN5, RADTAN8])
 def test_radtan_projection_equals_opencv(coefficients):
     camera = make_camera("radtan", coefficients)

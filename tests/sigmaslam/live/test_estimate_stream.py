@@ -143,3 +143,9 @@ def test_a_callback_gets_every_estimate_once_it_is_on_disk(sequence: Path, tmp_p
 def test_what_is_no_stream_is_refused(target: str):
     with pytest.raises(InputError, match=r"stdout, or udp://HOST:PORT"):
         open_stream(target)
+
+
+@pytest.mark.parametrize("host", ["nowhere.invalid", ".."])
+def test_a_host_that_is_not_there_is_named(host: str):
+    with pytest.raises(InputError, match=f"{host}:5005.* name a host that there is"):
+        open_stream(f"udp://{host}:5005")

@@ -1,8 +1,10 @@
 """Keyframes that left the window: kept within bounds, found again, and a map to localise in."""
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 
 import cv2
@@ -577,6 +579,40 @@ def test_poses_are_in_the_world_of_the_map(demo: Demo, demo_run: Path):
     errors = se3_log(se3_inverse(final.poses) @ truth[10:16])
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.01
     assert squared_sigmas(errors, covariances).max() < WITHIN_3_SIGMA
+
+
+def test_a_tracker_takes_one_map_and_no_later_one(demo: Demo, demo_run: Path):
+    """Keyframes of two would have the same numbers."""
+    camera, frames, _ = demo
+    for before in ("map", "frame"):
+        tracker = StereoTracker(camera)
+        if before == "map":
+            tracker.load_map(demo_run / "map.npz")
+        else:
+            tracker.step(frames[0].left, frames[0].right, frames[0].timestamp)
+        with pytest.raises(InputError, match="takes one map"):
+            tracker.load_map(demo_run / "map.npz")
+
+
+def test_results_may_be_taken_while_another_thread_steps(demo: Demo):
+    camera, frames, _ = demo
+    tracker, taken, ended = StereoTracker(camera, threads=1), [], Event()
+
+    def take():
+        while not ended.is_set():
+            final, covariances = tracker.final_trajectory()
+            taken.append(len(final) == len(covariances))
+            tracker.map()
+            tracker.pack_keyframes()
+
+    with ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(take)
+        for frame in frames[:12]:
+            tracker.step(frame.left, frame.right, frame.timestamp)
+        ended.set()
+        reading.result()
+    assert taken
+    assert all(taken)
 
 
 @pytest.mark.long

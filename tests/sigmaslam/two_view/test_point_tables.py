@@ -67,6 +67,18 @@ def test_pixels_that_do_not_belong_together_are_told_of(tmp_path: Path):
         assert words or "miss" not in found.stdout
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_no_pair_of_pixels_keeps_the_others_from_their_points(method: str):
+    """Of a thousand random ones the steps of four diverge."""
+    rig, random = RIGS["radtan"], np.random.default_rng(0)
+    eyes = (rig.left, rig.right)
+    wild = np.column_stack([random.uniform(0, (eye.width, eye.height), (3_000, 2)) for eye in eyes])
+    points = scene(20, seed=1)
+    pixels = np.concatenate([seen(rig, points), wild])
+    found, _ = triangulate_pairs(rig, pixels, np.tile(SIGMA**2 * np.eye(4), (len(pixels), 1, 1)), method)
+    np.testing.assert_allclose(found[:20], points, atol=1e-6)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_the_covariance_is_that_of_a_monte_carlo(method: str):
