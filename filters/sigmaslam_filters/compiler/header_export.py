@@ -79,7 +79,10 @@ def write_header(
         f"// mean: Number[{belief.mean.shape[-1]}]; {held_name}: Number[{held.numel()}], row by row.",
         *(f"// {name}: Number{[*each.shape]}." for name, each in (motion[1] if motion else {}).items()),
         *(f"// {name}: Number{[*each.shape]}." for name, each in (given if measurement else {}).items()),
-        "#pragma once", "#include <cmath>", "#include <cstdint>", f"namespace {space} {{", f"using Number = {number};",
+        "#pragma once",
+        "#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__",
+        '#error "NaN is a missing value: compile without -ffast-math, or with -fno-finite-math-only after it"',
+        "#endif", "#include <cmath>", "#include <cstdint>", f"namespace {space} {{", f"using Number = {number};",
     ]  # fmt: skip
     text = "\n".join([*head, HELPERS.replace("static inline", "inline"), *parts, f"}}  // namespace {space}", ""])
     path.write_text(text)

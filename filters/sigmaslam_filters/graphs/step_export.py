@@ -99,10 +99,12 @@ def export_step(
     Raises:
         ExportError: the models use something that ONNX or ONNX Runtime lacks, or the graph differs from torch by more
             than `TOLERANCES`. Nothing is written.
-        ValueError: the example does not fit the models.
+        ValueError: the example does not fit the models, or the name ends otherwise.
     """
-    step = _Step(bayes, motion, measurement, _complete(example), gate, robust)
     path = Path(path)
+    if path.suffix not in (".onnx", ".hpp"):
+        raise ValueError(f"{path}: give a name that ends in .onnx or .hpp")
+    step = _Step(bayes, motion, measurement, _complete(example), gate, robust)
     # In place only when it is right: a graph that was there stays until then.
     path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=path.parent) as folder:
