@@ -18,7 +18,7 @@ from sigmaslam.calibration.calibration_report import (
 from sigmaslam.calibration.image_bootstrap import RESAMPLES, bootstrap_rigs, widened
 from sigmaslam.calibration.imu_calibration import MAX_ROUNDS, calibrate_imu
 from sigmaslam.calibration.imu_report import board_path, describe_imu_calibration, image_times, write_imu_calibration
-from sigmaslam.calibration.lens_choice import calibrate_whole_images
+from sigmaslam.calibration.lens_choice import USUAL_LENS, calibrate_whole_images
 from sigmaslam.calibration.rectified_folder import write_rectified
 from sigmaslam.calibration_files.calibration_writer import describe_calibration
 from sigmaslam.calibration_files.foreign_calibrations import FORMS, write_foreign_calibration
@@ -113,6 +113,8 @@ def board(
         typer.echo(f"left out  {name}: {reason}")
     if lens.value == "auto":
         result = calibrate_whole_images(seen.names, seen.views, plan.points, seen.sizes)
+        if len(result.rig.eyes[0].distortion) != LENSES[USUAL_LENS][1]:
+            typer.echo(f"lens      not {USUAL_LENS}, which folds inside the images")
     else:
         result = solve(seen.names, seen.views, plan.points, seen.sizes, lens.value)
     describe_board_calibration(result)  # what makes no stereo pair says so before long work
