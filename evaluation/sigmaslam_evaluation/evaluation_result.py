@@ -76,7 +76,7 @@ class Evaluation:
         """Plain numbers, texts and lists for JSON; None stands for what could not be computed."""
         result = {
             "estimate": str(self.estimate_path),
-            "truth": str(self.truth_path),
+            "truth": str(self.truth_path.resolve()),
             "association": self.association,
             "truth_hint": self.truth_hint,
             "truth_notes": list(self.truth_notes),

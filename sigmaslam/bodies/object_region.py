@@ -63,8 +63,7 @@ def _is_there(path: Path) -> bool:
 
 def inner_half(region: np.ndarray) -> np.ndarray:
     """The inside of a region (H, W) bool: what is at least half as far from its border as its innermost pixel."""
-    padded = np.pad(region.astype(np.uint8), 1)
-    distance = cv2.distanceTransform(padded, cv2.DIST_L2, 3)[1:-1, 1:-1]
+    distance = cv2.distanceTransform(np.pad(region.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     return np.asarray(distance >= 0.5 * distance.max())
 
 

@@ -77,8 +77,7 @@ def _check(path: Path, tracks: Tracks, frames: int) -> None:
     refuse(~np.isfinite(tracks.measurement[:, :2]).all(axis=1), "u or v is not finite")
     refuse(np.isinf(tracks.measurement[:, 2]), "disparity is infinite")
     covariance = without_disparity(tracks.measurement, tracks.covariance)
-    finite = np.isfinite(covariance).all(axis=(1, 2))
-    refuse(~finite, "covariance is not finite")
+    refuse(~np.isfinite(covariance).all(axis=(1, 2)), "covariance is not finite")
     refuse(np.linalg.eigvalsh(covariance)[:, 0] <= 0, "covariance is not positive definite")
     if not np.isfinite(tracks.intrinsics).all() or (tracks.intrinsics[[0, 1, 4]] <= 0).any():
         raise InputError(f"{path}: intrinsics {tracks.intrinsics} need positive fx, fy and baseline; {_MEND}")

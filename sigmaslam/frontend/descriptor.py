@@ -209,8 +209,7 @@ class DescriptorFrontend:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which of the points (M, 2) are found in the right image from a start, their disparities and sigmas."""
         found = match_rows(self._estimator, left, right, points, start, sigma0, search)
-        disparity = points[found.index, 0] - found.places[:, 0]
-        return found.index, disparity, np.sqrt(found.covariance[:, 0, 0])
+        return found.index, points[found.index, 0] - found.places[:, 0], np.sqrt(found.covariance[:, 0, 0])
 
 
 @dataclass(frozen=True, slots=True)

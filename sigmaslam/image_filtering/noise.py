@@ -49,8 +49,7 @@ class NoiseModel:
 
     def variance(self, signal: np.ndarray) -> np.ndarray:
         """Variance of pixels, in the shape of the signal; float32."""
-        constant = self.sigma**2 + self.step**2 / 12.0
-        return np.asarray(constant + self.gain * np.maximum(signal, 0.0), np.float32)
+        return np.asarray(self.sigma**2 + self.step**2 / 12.0 + self.gain * np.maximum(signal, 0.0), np.float32)
 
 
 def estimate_noise(image: np.ndarray) -> NoiseModel:

@@ -44,6 +44,5 @@ def _picture(check: Check, number: int) -> str:
     """A data URI of the rectified pair, left above right, with some of its matches."""
     left, right = check.rectified[number]
     rows = np.flatnonzero(check.matches.pair == number)
-    every = max(1, len(rows) // _SHOWN)
-    canvas = draw_rows(left, right, check.matches.select(rows[::every]), ROW_TOLERANCE)
+    canvas = draw_rows(left, right, check.matches.select(rows[:: max(1, len(rows) // _SHOWN)]), ROW_TOLERANCE)
     return data_url(small_jpeg(canvas, _WIDTH, 80))

@@ -1,6 +1,7 @@
 """What a report says in words and figures."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -46,6 +47,8 @@ def judge(run: RecordedRun) -> State:
     notices += [("warn", each) for each in doubts_verdict(run.summary)]
     findings = wrong([Finding(**each) for each in (*run.entries.get("checks", ()), *run.summary.get("imu", ()))])
     notices += [("warn", f"{each.name}: {each.message}") for each in findings if each.message not in (failure or "")]
+    if hint := run.evaluation.get("truth_hint"):
+        notices.append(("warn", f"Errors are of no use: the truth looks like {hint}."))
     verdict = run.evaluation.get("nees_verdict")
     if verdict and verdict["kind"] == "warn":
         notices.append(("warn", verdict["text"]))
@@ -68,6 +71,8 @@ def list_facts(run: RecordedRun) -> Facts:
         ("duration", f"{frames.seconds[-1]:.1f} s"),
         ("path length", f"{run.trajectory.path_length:.2f} m"),
     ]
+    if resumed := run.entries.get("resumed_at"):
+        facts.append(("stopped and resumed", f"at frame {', '.join(map(str, resumed))}"))
     position, rotation = run.sigmas
     if len(position) and np.isfinite(position[-1]):
         facts.append(("sigma at the end", f"{format_length(position[-1])}, {np.degrees(rotation[-1]):.2g}°"))
@@ -100,7 +105,7 @@ def list_calibration(run: RecordedRun) -> list[tuple[str, str, str]]:
     known = np.flatnonzero(np.isfinite(offset))
     rows = []
     if len(known) and len(run.trajectory):
-        rows.append(("disparity offset [px]", f"{offset[known[-1]]:+.3f}", f"{sigma[known[-1]]:.3f}"))
+        rows.append(("disparity offset of these images [px]", f"{offset[known[-1]]:+.3f}", f"{sigma[known[-1]]:.3f}"))
     for name, (value, sigma) in (run.summary.get("calibration_errors") or {}).items():
         unit = "" if name in ("focal", "baseline") else " [px at 45°]"
         rows.append((name.replace("_", " ") + unit, f"{value:+.5g}", f"{sigma:.2g}"))
@@ -190,7 +195,8 @@ def list_refinement(run: RecordedRun) -> Facts:
 def _errors(run: RecordedRun) -> Facts:
     if not run.evaluation:
         return []
-    facts = [("ATE, best alignment", format_length(run.evaluation["ate"]["rmse"]))]
+    facts = [("truth", "/".join(Path(run.evaluation.get("truth", "?")).parts[-2:]))]
+    facts.append(("ATE, best alignment", format_length(run.evaluation["ate"]["rmse"])))
     nees = run.evaluation.get("nees") or {}
     if nees.get("mean") is not None:
         facts.append(("NEES per dof", f"{nees['mean']:.2f}"))

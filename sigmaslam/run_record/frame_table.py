@@ -59,8 +59,7 @@ class FrameTable:
     def total_milliseconds(self) -> np.ndarray:
         """(N,) time spent on each frame; NaN where no stage has a time."""
         stages = np.array(list(self.milliseconds.values())).reshape(-1, len(self))
-        measured = np.isfinite(stages).any(axis=0)
-        return np.where(measured, np.nansum(stages, axis=0), np.nan)
+        return np.where(np.isfinite(stages).any(axis=0), np.nansum(stages, axis=0), np.nan)
 
 
 def predicted_poses(frames: FrameTable, timestamps: np.ndarray) -> np.ndarray:

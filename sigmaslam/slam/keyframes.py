@@ -106,8 +106,7 @@ class Keyframes:
         anchor, feature = landmarks.anchor[seen.landmark], landmarks.feature[seen.landmark]
         blurs = np.array([keyframe.blur for keyframe in self.active])[anchor]
         # Compared with the sharpest keyframes that share enough with the image.
-        by_sharpness = np.argsort(blurs, kind="stable")
-        sharp = np.flatnonzero(blurs <= blurs[by_sharpness[:_COMPARED]].max())
+        sharp = np.flatnonzero(blurs <= blurs[np.argsort(blurs, kind="stable")[:_COMPARED]].max())
         first = np.cumsum([0] + [len(keyframe.energies) for keyframe in self.active])[anchor[sharp]]
         energies = np.concatenate([keyframe.energies for keyframe in self.active])[first + feature[sharp]].sum(axis=0)
         here = patch_energies(left, seen.measurement[sharp, :2]).sum(axis=0)

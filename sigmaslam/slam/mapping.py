@@ -192,6 +192,5 @@ class Mapper:
         scale = np.clip(np.sqrt(view.left.size / _FULL_SPACING_FROM), _LEAST_SPACING, 1.0)
         spacing = float(scale) * self.config.spacing
         index = index[select_spaced(view.features.select(index), taken, spacing, view.left.shape)]
-        measured = view.measured(index)
-        self.window.add_landmarks(index, measured, blur * self.noise.of_keypoints(view, index))
+        self.window.add_landmarks(index, view.measured(index), blur * self.noise.of_keypoints(view, index))
         return index

@@ -272,8 +272,7 @@ def _ideal(points: np.ndarray, models: tuple[CameraModel, CameraModel] | None, n
     """(M, 2) pixels without distortion, float64."""
     if models is None:
         return points.astype(np.float64)
-    rays = models[number].unproject(points.astype(np.float64))
-    return np.asarray((rays @ models[number].matrix.T)[:, :2])
+    return np.asarray((models[number].unproject(points.astype(np.float64)) @ models[number].matrix.T)[:, :2])
 
 
 def _plane_share(points0: np.ndarray, points1: np.ndarray) -> float:

@@ -39,8 +39,7 @@ class TwoViews:
         """(..., 4) pixels (u0, v0, u1, v1) of points (..., 3) in camera 0."""
         in_first = points @ self.K0.T
         in_second = (points @ self.T_1_0[:3, :3].T + self.T_1_0[:3, 3]) @ self.K1.T
-        pixels = [each[..., :2] / each[..., 2:] for each in (in_first, in_second)]
-        return np.concatenate(pixels, axis=-1)
+        return np.concatenate([each[..., :2] / each[..., 2:] for each in (in_first, in_second)], axis=-1)
 
 
 def triangulate_parallel(views: TwoViews, pixels: np.ndarray) -> np.ndarray:

@@ -122,6 +122,7 @@ def test_runs_with_one_truth_are_aligned_by_it(tmp_path):
         "two error",
     ]
     assert "ATE [m], as it was said 0.5 0.5" in page.words
+    assert "truth t.tum t.tum" in page.words
 
 
 def test_runs_without_common_times_stand_beside_each_other(tmp_path):

@@ -33,7 +33,7 @@ function buildPlot(box, seconds, intervals, plot, select) {
   const options = {
     width: box.clientWidth, height: 230, cursor: { sync: { key: "run" } },
     scales: { x: { time: false }, y: plot.log ? { distr: 3 } : { range: plot.range } },
-    series: [{ label: "time [s]", value: write }, ...series], bands: plot.bands, axes: [axis, { ...axis, size: 62 }],
+    series: [{ label: "time [s]", value: write }, ...series], bands: plot.bands, axes: [axis, { ...axis, size: 62, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : write(_, tick))) }],
     hooks: { drawClear: [shadeStatuses(intervals)] },
   };
   if (!plot.log && !plot.range) delete options.scales.y;

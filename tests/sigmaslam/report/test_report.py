@@ -104,6 +104,13 @@ def test_a_run_that_was_stopped_says_so(tmp_path):
     assert "did not come to its end: interrupted by SIGTERM." in _text(tmp_path / "run")
 
 
+def test_a_run_that_went_on_says_from_where(tmp_path):
+    """What it knew of its first part is gone."""
+    make_run(tmp_path / "run")
+    (tmp_path / "run/run.json").write_text(json.dumps({"resumed_at": [40, 80]}))
+    assert "stopped and resumed at frame 40, 80" in _text(tmp_path / "run")
+
+
 def test_ellipsoids_are_the_covariances_of_positions_in_the_world(tmp_path):
     make_run(tmp_path / "run")
     scene = _page(tmp_path / "run").data["scenes"][0]
@@ -202,7 +209,8 @@ def test_an_evaluation_is_in_the_report(tmp_path):
     ate = {"rmse": 0.1234, "rotation_rmse_deg": 0.5}
     errors = {"ate": ate, "ate_origin": ate, "rpe": {"translation_rmse": 0.01}, "nees": {"mean": 2.5, "inside": 0.4}}
     verdict = {"kind": "warn", "text": "NEES over 20 s is 16: so it is."}
-    write_evaluation(run, {**errors, "final": None, "truth_hint": None, "nees_verdict": verdict}, frames)
+    errors |= {"truth": "/home/me/room/poses.txt", "final": None}
+    write_evaluation(run, {**errors, "truth_hint": None, "nees_verdict": verdict}, frames)
     page = _page(run)
     text = page.words
     html = (run / "report.html").read_text()
@@ -210,7 +218,7 @@ def test_an_evaluation_is_in_the_report(tmp_path):
     assert '<span class="state warn">' in html
     assert text.count(verdict["text"]) == 2
     assert "as it was said 0.1234 0.1234 0.5 0.01 2.50 40 %" in text
-    assert "NEES per dof 2.50" in text
+    assert "truth room/poses.txt ATE, best alignment 12.3 cm NEES per dof 2.50" in text
     # A frame is skipped before the first of them.
     np.testing.assert_allclose(page.values("Error of the position", "error")[61 : 61 + count], line, atol=1e-6)
     np.testing.assert_allclose(
@@ -218,6 +226,9 @@ def test_an_evaluation_is_in_the_report(tmp_path):
     )
     np.testing.assert_allclose(page.values("NEES", "NEES / dof")[61 : 61 + count], 2 * line + 0.1, rtol=1e-5)
     np.testing.assert_allclose(unpack(page.data["scenes"][0]["truth"], 3)[:, 0], line, atol=1e-6)
+    write_evaluation(run, {**errors, "truth_hint": "positions in mm", "nees_verdict": None}, frames)
+    assert "Errors are of no use: the truth looks like positions in mm." in _text(run)
+    assert '<span class="state warn">' in (run / "report.html").read_text()
 
 
 def test_a_refinement_is_in_the_report(tmp_path):
