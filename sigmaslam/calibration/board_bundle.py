@@ -113,8 +113,7 @@ def solve_bundle(rig: Rig, poses: np.ndarray, corners: Corners, weights: np.ndar
     residuals = _residuals(rig, poses, corners)
     cost = float(each @ np.sum(residuals**2, axis=1))
     for _ in range(_MAX_STEPS):
-        system = _linearise(rig, poses, corners, residuals)
-        step, steps = _step(system, weights, damping)
+        step, steps = _step(_linearise(rig, poses, corners, residuals), weights, damping)
         try:
             trial = rig.moved(step), nearest_rigid(se3_exp(steps) @ poses)
         except CalibrationError:

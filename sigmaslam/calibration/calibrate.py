@@ -207,8 +207,7 @@ def _calibrate_eye(corners: Corners, size: tuple[int, int], lens: str) -> Camera
     for focal in (_FOCAL_STARTS * max(size)).tolist():
         start = CameraModel(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, 0.0, model, (0.0,) * count)
         rig = Rig((start,), np.eye(4))
-        poses = _board_poses(rig, corners)
-        rms = [image_rms for image_rms, _ in poses.values()]
+        rms = [image_rms for image_rms, _ in _board_poses(rig, corners).values()]
         if len(rms) >= MIN_IMAGES and np.median(rms) < least:
             best, least = rig, float(np.median(rms))
     if best is None:

@@ -118,8 +118,7 @@ def _parallel_rotations(camera: StereoCamera) -> tuple[np.ndarray, np.ndarray]:
     axis = np.cross(baseline, [1.0, 0.0, 0.0])
     length = np.linalg.norm(axis)
     if length > 0:
-        angle = np.arctan2(length, baseline[0])
-        align, _ = cv2.Rodrigues(axis * (angle / length))
+        align, _ = cv2.Rodrigues(axis * (np.arctan2(length, baseline[0]) / length))
     else:
         align = np.eye(3)
     return align @ half.T, align @ half

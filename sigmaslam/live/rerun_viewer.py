@@ -116,7 +116,8 @@ class RerunSink:
         self._is_open = True
         camera = self._points.camera
         self._recording.log("world", rr.ViewCoordinates.RDF, static=True)
-        lens = rr.Pinhole(image_from_camera=camera.matrix, resolution=[camera.width, camera.height])
+        matrix = camera.matrix + [[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]  # as pixels below
+        lens = rr.Pinhole(image_from_camera=matrix, resolution=[camera.width, camera.height])
         self._recording.log(IMAGE, lens, static=True)
 
     def _show_image(self, seen: MatchedFrame) -> None:

@@ -197,11 +197,11 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> tuple[list[str], np.nda
         except (TypeError, ValueError):
             values, sigma = [np.nan], np.nan
         # By None stands what is more than the header has columns, as of decimal commas.
-        if not np.isfinite(values).all() or sigma <= 0.0 or any(row.get(None, ())):
+        if not np.isfinite(values).all() or sigma <= 0.0 or sigma == np.inf or any(row.get(None, ())):
             cells = shorten(",".join(str(cell) for cell in row.values()))
             raise InputError(
                 f"{path}, line {reader.line_num}: '{cells}' is not one finite number a column, or its sigma is not "
-                "positive: mend it"
+                "positive and finite: mend it"
             )
         names.append(row.get("id") or str(number))
         rows.append([*values, sigma])

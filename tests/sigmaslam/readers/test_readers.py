@@ -701,6 +701,8 @@ def test_two_videos(tmp_path, format):
     sequence, frames = read_all(tmp_path, format=format)
     assert (sequence.format, sequence.length, sequence.timestamps) == ("video", 7, None)
     check_video_frames(frames, 7)
+    with pytest.raises(InputError, match="is the video of one eye, the other lies beside it"):
+        open_sequence(tmp_path / "left.avi", format="video")
 
 
 def test_side_by_side_video(tmp_path):

@@ -175,6 +175,8 @@ def test_bad_tables_are_refused(tmp_path: Path):
     )
     wrong.write_text("u0,v0,u1,v1\n320,5,240,1,300,2,240,0\n")
     assert_refused(run_here("images", "triangulate", wrong, *rest), "a.csv, line 2: '320,5,240,1,")
+    wrong.write_text("u0,v0,u1,v1,sigma\n320,5,240,5,inf\n")
+    assert_refused(run_here("images", "triangulate", wrong, *rest), "its sigma is not positive and finite")
     right = write_csv(tmp_path / "c.csv", "u0,v0,u1,v1", seen(rectified_rig(), scene(3, 7)))
     found = run_here("images", "triangulate", right, "--calibration", rig, "--out", tmp_path)
     assert_refused(found, "is a folder: give the name of a file in it")
