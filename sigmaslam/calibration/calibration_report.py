@@ -171,5 +171,4 @@ def _names(result: BoardCalibration) -> tuple[str, ...]:
 
 def _rounded(values: np.ndarray) -> Any:
     """Lists of numbers with nine digits."""
-    flat = [float(f"{value:.9g}") for value in values.ravel().tolist()]
-    return np.array(flat).reshape(values.shape).tolist()
+    return np.array([float(f"{value:.9g}") for value in values.ravel().tolist()]).reshape(values.shape).tolist()

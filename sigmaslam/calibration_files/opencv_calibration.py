@@ -160,8 +160,7 @@ def _from_matrices(
         models.append(camera_model(where, size, intrinsics_of(K), *_lens(storage, D), key=D))
     rotation = _matrix(storage, "R")
     R = cv2.Rodrigues(rotation)[0] if rotation.size == 3 else _matrix(storage, "R", (3, 3))
-    T_right_left = rigid_motion(R, _matrix(storage, "T", (3,)))
-    return stereo_camera(f"{storage.path}: R and T", models, T_right_left)
+    return stereo_camera(f"{storage.path}: R and T", models, rigid_motion(R, _matrix(storage, "T", (3,))))
 
 
 def _lens(storage: CalibrationYaml, key: str) -> tuple[str, list[float]]:

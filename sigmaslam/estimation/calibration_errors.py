@@ -127,8 +127,7 @@ class CalibrationPrior:
     @classmethod
     def independent(cls, sigma: np.ndarray, *estimated: str) -> Self:
         """Independent errors with standard deviations of the first of `ERRORS`, in which `estimated` are names."""
-        variance = np.pad(np.square(sigma), (0, len(ERRORS) - len(sigma)))
-        return cls(np.diag(variance), np.isin(ERRORS, estimated))
+        return cls(np.diag(np.pad(np.square(sigma), (0, len(ERRORS) - len(sigma)))), np.isin(ERRORS, estimated))
 
 
 def measured_errors(camera: RectifiedStereo, uvd: np.ndarray) -> np.ndarray:

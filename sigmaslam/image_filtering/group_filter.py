@@ -36,8 +36,7 @@ def filter_groups(image: np.ndarray, variance: np.ndarray, pilot: np.ndarray) ->
     padded, guide, noise = (pad(each, border) for each in (image, pilot, variance))
     height, width = guide.shape
     ys = _grid(border - _SIZE + 1, height - border)
-    xs = _grid(border - _SIZE + 1, width - border)
-    members = _alike(guide, ys, xs)
+    members = _alike(guide, ys, _grid(border - _SIZE + 1, width - border))
     noise = cv2.boxFilter(noise, -1, (_SIZE, _SIZE), anchor=(0, 0), borderType=cv2.BORDER_REFLECT).ravel()
     offsets = np.array([y * width + x for y, x in product(range(_SIZE), repeat=2)])
     total, weights = np.zeros((len(offsets), height * width)), np.zeros(height * width)

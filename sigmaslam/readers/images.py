@@ -63,8 +63,7 @@ def read_image(path: Path) -> np.ndarray:
     Raises:
         FrameError: the file is missing, empty, truncated, too large or no image.
     """
-    content = read_bytes(path, MAX_FILE_BYTES, "the image", FrameError)
-    return decode_image(content, str(path))
+    return decode_image(read_bytes(path, MAX_FILE_BYTES, "the image", FrameError), str(path))
 
 
 def decode_image(content: bytes, name: str) -> np.ndarray:
@@ -218,8 +217,7 @@ class ImagePairs(PairSource):
             raise InputError(f"{source}: no pair of left and right images")
         if len(files) != len(timestamps):
             raise InputError(f"{source}: {len(files)} pairs but {len(timestamps)} timestamps")
-        steps = np.diff(timestamps, prepend=-np.inf)
-        wrong = np.flatnonzero(~((steps > 0) & np.isfinite(timestamps)))
+        wrong = np.flatnonzero(~((np.diff(timestamps, prepend=-np.inf) > 0) & np.isfinite(timestamps)))
         if len(wrong):
             first = int(wrong[0])
             raise InputError(

@@ -230,8 +230,7 @@ def kalman_update(
     gain = derivative * variance / (derivative**2 * variance + noise)
     moved = np.where(agrees, mean + gain * innovation, mean)
     # Joseph's form in one state stays positive whatever the rounding.
-    left = (1.0 - gain * derivative) ** 2 * variance + gain**2 * noise
-    return moved, np.where(agrees, left, variance)
+    return moved, np.where(agrees, (1.0 - gain * derivative) ** 2 * variance + gain**2 * noise, variance)
 
 
 def step_products(covariance: np.ndarray) -> np.ndarray:

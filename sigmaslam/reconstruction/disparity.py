@@ -150,8 +150,7 @@ def _semi_global(left: np.ndarray, right: np.ndarray, largest: float, speckle: f
     settings = {**costs, "uniquenessRatio": _UNIQUE, "speckleWindowSize": speckle_size}
     disparity = semi_global(left, right, _LEAST, levels, **settings)
     # What would lie left of the right image matches its repeated border.
-    inside = disparity <= np.arange(left.shape[1], dtype=np.float32)
-    return np.where(inside, disparity, np.float32(np.nan))
+    return np.where(disparity <= np.arange(left.shape[1], dtype=np.float32), disparity, np.float32(np.nan))
 
 
 def align_disparity(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> DisparityMap:

@@ -214,8 +214,7 @@ def _speed(run: RecordedRun) -> Facts:
         facts.append(("speed", f"{1000 / milliseconds:.1f} frames/s"))
         interval = frame_interval(run.frames)
         if interval:
-            ratio = 1e3 * interval / milliseconds
-            facts.append(("real time", f"{ratio:.2g} × {1 / interval:.3g} frames/s"))
+            facts.append(("real time", f"{1e3 * interval / milliseconds:.2g} × {1 / interval:.3g} frames/s"))
     timing = run.entries.get("real_time")
     if isinstance(timing, dict):
         return [*facts, ("dropped", f"{timing['dropped']}"), ("latency", f"{format_latency(timing['latency_ms'])} ms")]

@@ -143,7 +143,8 @@ class Mapper:
                 step = fit.step
         # Streaks hide what moves, and it draws the pose: frames that see the keyframe's landmarks share that.
         drawn = 0.0 if Doubt.TIME in doubts.reasons else doubts.spread  # the image's own pose knows of no stamp
-        spread = matches.streaked * (drawn + (1.0 - 1.0 / fit.clustering) * fit.relative)
+        spread = (matches.streaked or doubts.is_ambiguous) * drawn
+        spread = spread + matches.streaked * (1.0 - 1.0 / fit.clustering) * fit.relative
         tracks = self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
         self.keyframes.active[-1] = replace(self.keyframes.active[-1], spread=spread)
         return tracks

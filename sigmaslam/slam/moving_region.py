@@ -32,17 +32,29 @@ class MovingRegion:
     def carry(self, left: np.ndarray, pose: np.ndarray, camera: RectifiedStereo) -> None:
         """Follows the places by optical flow into the next left image (H, W), seen from `pose` (4, 4)."""
         if len(self._places):
-            seen = transform_points(se3_inverse(pose), self._points)
-            front = seen[:, 2] > 0.0
-            at_rest = camera.project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]))[:, :2]
+            at_rest, front = self._seen_from(pose, camera)
             guess = np.clip(at_rest + self._departure, 0, (left.shape[1] - 1, left.shape[0] - 1))
             self._places, found = lucas_kanade(self._left, left, self._places, guess, _WINDOW, _LEVELS)
             self._departure, self._age = self._places - at_rest, self._age + 1
             rests = are_one_place(np.linalg.norm(self._departure, axis=1))
-            kept = found & front & ~(rests & (self._age > self._patience))
-            self._places, self._points = self._places[kept], self._points[kept]
-            self._departure, self._age = self._departure[kept], self._age[kept]
+            self._keep(found & front & ~(rests & (self._age > self._patience)))
         self._left = left
+
+    def keep_if_seen_from(self, pose: np.ndarray, camera: RectifiedStereo) -> None:
+        """Forgets all places but if at least half are nearer to where `pose` (4, 4) sees their points than to rest."""
+        apart = np.linalg.norm(self._seen_from(pose, camera)[0] - self._places, axis=1)
+        moves = apart < np.linalg.norm(self._departure, axis=1)
+        self._keep(np.full(len(moves), 2 * moves.sum() >= len(moves)))
+
+    def _seen_from(self, pose: np.ndarray, camera: RectifiedStereo) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 2) where a camera sees the points at rest, and (K,) whether they are before it."""
+        seen = transform_points(se3_inverse(pose), self._points)
+        front = seen[:, 2] > 0.0
+        return camera.project(np.where(front[:, None], seen, [0.0, 0.0, 1.0]))[:, :2], front
+
+    def _keep(self, kept: np.ndarray) -> None:
+        self._places, self._points = self._places[kept], self._points[kept]
+        self._departure, self._age = self._departure[kept], self._age[kept]
 
     def add(self, places: np.ndarray, points: np.ndarray, departure: np.ndarray) -> None:
         """Takes places (K, 2) in the last image that was carried to, which are those of points (K, 3) in the world at

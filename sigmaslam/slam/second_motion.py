@@ -156,8 +156,7 @@ def _most_departing(cells: np.ndarray, others: np.ndarray, departs: np.ndarray) 
     """
     share = 1.0 / np.bincount(cells)[cells[others]]
     same = are_one_place(departs)
-    order = np.lexsort((-share, same))
-    return _among(others[order[: 2 * (~same).sum()]], len(cells))
+    return _among(others[np.lexsort((-share, same))[: 2 * (~same).sum()]], len(cells))
 
 
 def _among(chosen: np.ndarray, count: int) -> np.ndarray:

@@ -74,8 +74,7 @@ def estimate_fundamental(
     (to0, scaled0), (to1, scaled1) = normalised(points0), normalised(points1)
     spread0 = (sigma0 * to0[0, 0]) ** 2 * np.eye(2)
     matches = MatchedRays(scaled0, scaled1, spread0, to1[0, 0] ** 2 * covariance.astype(np.float64))
-    F = np.linalg.inv(to1).T @ start @ np.linalg.inv(to0)
-    u, values, vt = np.linalg.svd(F)
+    u, values, vt = np.linalg.svd(np.linalg.inv(to1).T @ start @ np.linalg.inv(to0))
     v, angle = vt.T, float(np.arctan2(values[1], values[0]))
     u, angle, v = _refine(matches, u, angle, v, lambda residual: probability * robust_weight(residual))
     # The robust loss wastes a part of good matches: the inliers alone, equally weighted, are used in full.
@@ -85,8 +84,7 @@ def estimate_fundamental(
     inliers = (np.abs(residual) < _INLIER) & (probability >= _MIN_PROBABILITY)
     by_step = np.stack([each.ravel() for each in _directions(u, angle, v)], axis=1)
     information = J[inliers].T @ J[inliers]
-    free = inliers.sum() <= _SEVEN or np.linalg.cond(information) > _MAX_CONDITION
-    if free:
+    if inliers.sum() <= _SEVEN or np.linalg.cond(information) > _MAX_CONDITION:
         spread = np.full((7, 7), np.inf)
     else:
         # Matches are not taken to be better than they say, and may err as their neighbours do.

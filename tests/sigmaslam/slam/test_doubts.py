@@ -13,7 +13,7 @@ import pytest
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam import scrutiny
-from sigmaslam.slam.doubt import Doubt
+from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Prediction
@@ -259,28 +259,31 @@ def test_a_shaken_camera_delivers_no_images_of_another_time(
     assert [k for k, each in enumerate(found) if Doubt.TIME in each.doubts] == doubted
 
 
-def test_frames_that_see_landmarks_of_a_streaked_keyframe_share_what_its_pose_leaves_out(
-    demo: Demo, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("doubt", ["streaked", "ambiguous"])
+def test_frames_that_see_landmarks_of_a_doubted_keyframe_share_what_its_pose_leaves_out(
+    demo: Demo, monkeypatch: pytest.MonkeyPatch, doubt: str
 ):
     """Poses are the same to the bit, and none is surer than without."""
     camera, frames, _ = demo
     insert = Mapper.insert_if_due
 
-    def insert_streaked(mapper: Mapper, *given: Any) -> KeyframeTracks | None:
-        given = *given[:2], replace(given[2], clustering=4.0), given[3], replace(given[4], streaked=True), *given[5:]
-        return insert(mapper, *given)
+    def insert_doubted(mapper: Mapper, *given: Any) -> KeyframeTracks | None:
+        given = *given[:2], replace(given[2], clustering=4.0), *given[3:]
+        if doubt == "ambiguous":
+            return insert(mapper, *given[:6], Doubts(spread=1e-6 * np.eye(6), is_ambiguous=True))
+        return insert(mapper, *given[:4], replace(given[4], streaked=True), *given[5:])
 
     def insert_clustered(mapper: Mapper, *given: Any) -> KeyframeTracks | None:
         return insert(mapper, *given[:2], replace(given[2], clustering=4.0), *given[3:])
 
     runs = []
-    for change in (insert_clustered, insert_streaked):
+    for change in (insert_clustered, insert_doubted):
         monkeypatch.setattr(Mapper, "insert_if_due", change)
         runs.append(track(StereoTracker(camera), frames[:FRAMES]))
     first = next(k for k, each in enumerate(runs[0]) if k > 1 and each.tracks is not None)
-    for k, (plain, streaked) in enumerate(zip(*runs, strict=True)):
-        assert np.array_equal(plain.T_world_camera, streaked.T_world_camera)
-        more = streaked.covariance - plain.covariance
+    for k, (plain, doubted) in enumerate(zip(*runs, strict=True)):
+        assert np.array_equal(plain.T_world_camera, doubted.T_world_camera)
+        more = doubted.covariance - plain.covariance
         if k > first:
             assert np.linalg.eigvalsh(more)[-1] > 0.0
             assert np.linalg.eigvalsh(more)[0] > -1e-9 * np.trace(more)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
+from sigmaslam.readers import open_sequence
+from sigmaslam.readers.selection import Selection
 from sigmaslam.slam.frozen_images import LastPairs, is_noise, shows_motion
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.estimates import Demo
@@ -116,6 +120,18 @@ def test_noise_is_no_scene(demo: Demo):
     assert not is_noise(scene)
     assert not is_noise(np.clip(scene + rng.normal(0.0, 25.0, scene.shape), 0, 255).astype(np.uint8))
     assert not is_noise(np.full((120, 160), 9, np.uint8))
+
+
+@pytest.mark.slow
+def test_a_gap_in_a_drive_leaves_no_second_motion_that_the_images_do_not_show(real_data: Path):
+    """Eight false matches of the first frame after it became one that parted on: 30 of 30 frames were ambiguous."""
+    sequence = open_sequence(real_data / "kitti_raw_0926_0039_a").select(Selection(count=60))
+    tracker, frames = StereoTracker(sequence.camera), list(sequence.frames())
+    shown = [frames[19] if 20 <= k < 30 else frame for k, frame in enumerate(frames)]
+    found = [tracker.step(one.left, one.right, frame.timestamp) for one, frame in zip(shown, frames, strict=True)]
+    after = [each.status for each in found[30:]]
+    assert after.count("ambiguous") <= 3
+    assert after.count("tracking") >= 25
 
 
 @pytest.mark.long

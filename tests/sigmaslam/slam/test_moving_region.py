@@ -57,5 +57,16 @@ def test_what_the_camera_passes_rests(texture: np.ndarray):
     assert not region
 
 
+@pytest.mark.parametrize("step", [9.0, 0.0, -9.0])
+def test_a_motion_that_the_image_does_not_show_is_forgotten(texture: np.ndarray, step: float):
+    """The image shifts as if the camera, which stands, went 9 px to the right; what else it may do was expected."""
+    region = region_in(texture[:, :160].copy(), patience=0)
+    region.carry(texture[:, 9:169].copy(), np.eye(4), CAMERA)
+    expected = np.eye(4)
+    expected[0, 3] = step * DEPTH / CAMERA.fx
+    region.keep_if_seen_from(expected, CAMERA)
+    assert bool(region) == (step > 0.0)
+
+
 def test_an_empty_region_covers_nothing():
     assert not MovingRegion(10.0, 0).covers(PLACES).any()
