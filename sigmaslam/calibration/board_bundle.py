@@ -169,8 +169,7 @@ def _linearise(
     rig: Rig, poses: np.ndarray, corners: Corners, residuals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """By image: C^-1 (n, 6, 6), C^-1 B^T (n, 6, P), C^-1 c (n, 6), and reduced information and gradient of the rig."""
-    total = len(rig.names)
-    by_rig, by_pose = np.zeros((len(corners), 2, total)), np.zeros((len(corners), 2, 6))
+    by_rig, by_pose = np.zeros((len(corners), 2, len(rig.names))), np.zeros((len(corners), 2, 6))
     frames, used = _in_eyes(rig, poses, corners), 0
     left = frames[0][1]
     for k, eye in enumerate(rig.eyes):

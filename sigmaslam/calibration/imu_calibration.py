@@ -228,8 +228,7 @@ def _start(times: np.ndarray, poses: np.ndarray, samples: InertialSamples, senso
     shift = sensor.time_shift + fit.delay
     forces = np.column_stack([np.interp(times + shift, samples.timestamp, each) for each in samples.accel.T])
     gravity = -np.mean(np.einsum("nij,nj->ni", R @ fit.rotation.T, forces), axis=0)
-    bodies = poses @ T_left_imu
-    speeds = np.gradient(bodies[:, :3, 3], times, axis=0)
+    speeds = np.gradient((poses @ T_left_imu)[:, :3, 3], times, axis=0)
     biases = np.tile(np.r_[fit.bias, np.zeros(3)], (len(times), 1))
     return _State(poses, speeds, biases, T_left_imu, gravity * (STANDARD_GRAVITY / np.linalg.norm(gravity)), shift)
 

@@ -38,8 +38,7 @@ def tracker_covariance(rig: Rig, covariance: np.ndarray) -> tuple[CalibrationCov
         """(M, 3) what the calibrated pair measures where the true one differs by a step."""
         return measured_places(uvd, _pair(rig.moved(step)), rectifier)
 
-    intrinsics = [name.partition(".")[2] in INTRINSICS for name in rig.names]
-    sizes = np.where(intrinsics, _STEP_PIXELS, _STEP)
+    sizes = np.where([name.partition(".")[2] in INTRINSICS for name in rig.names], _STEP_PIXELS, _STEP)
     columns = [
         ((measured(step) - measured(-step)) / (2.0 * size)).ravel()
         for step, size in zip(np.diag(sizes), sizes.tolist(), strict=True)

@@ -214,5 +214,4 @@ def _same(of_forces: np.ndarray | None, axes: np.ndarray | None) -> bool:
 
 def _describe(axes: np.ndarray) -> str:
     """Which axes a sensor has in the place of x, y, z, such as "y, -x, z"."""
-    names = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in axes]
-    return ", ".join(names)
+    return ", ".join([f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in axes])

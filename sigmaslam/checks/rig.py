@@ -139,8 +139,7 @@ def _check_distortion(matches: EyeMatches, rectifier: StereoRectifier) -> Findin
     before, after = (_mad(fit_rows(each, rectifier.rectified).residual) for each in (stored, matches))
     rows = float(np.median(np.abs(stored.row_difference)))
     # A median of absolute values is known to about one part in the root of their number.
-    worse = after > before * (1.0 + SIGNIFICANT / np.sqrt(len(stored)))
-    if rows < _RECTIFIED_ROWS and worse:
+    if rows < _RECTIFIED_ROWS and after > before * (1.0 + SIGNIFICANT / np.sqrt(len(stored))):
         message = (
             f"the images look rectified already: rows scatter by {before:.2f} px as they are stored, by {after:.2f} px "
             "after the rectification: give the calibration of the rectified images (no distortion)"

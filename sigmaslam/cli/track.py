@@ -217,8 +217,7 @@ def track(
     if not (overwrite or resume):
         check_new_folder(out, "--out, give --overwrite or --resume")
     with open_sinks(request.live, out, sequence.camera) as sinks:
-        findings = _check(sequence, strict, threads)
-        opened = InputOptions(sequence, findings=findings)
+        opened = InputOptions(sequence, findings=_check(sequence, strict, threads))
         tell_summary(_track(replace(request, input=opened, live=LiveOptions(sinks=sinks))), out)
 
 

@@ -149,5 +149,4 @@ def _are_multiples(steps: np.ndarray) -> bool:
     frames = np.round(steps / max(float(steps.min()), np.finfo(float).tiny))
     if frames.max() > _MOST_DROPPED:
         return False
-    departure = steps * frames.sum() / steps.sum() - frames
-    return float(np.sqrt(np.mean(departure**2))) <= _BELIEVED
+    return float(np.sqrt(np.mean((steps * frames.sum() / steps.sum() - frames) ** 2))) <= _BELIEVED

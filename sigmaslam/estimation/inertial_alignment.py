@@ -106,8 +106,7 @@ def align(
         motions: N - 1 between successive poses, integrated with the gyro's bias and without the accelerometer's.
         sensor_sigma: (25,) of the clock's delay, scale and misalignment, and the mounting, perturbed from the left.
     """
-    bodies = poses @ mounting
-    found, covariance, excess, columns = _solve(bodies, motions)
+    found, covariance, excess, columns = _solve(poses @ mounting, motions)
     if excess > _LENGTH_TOLERANCE or _tilt(covariance) > _LEAST_TILT_CERTAINTY:
         return None
     columns = columns * sensor_sigma[:-6]

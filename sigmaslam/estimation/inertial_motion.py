@@ -239,5 +239,4 @@ class InertialMotion(MotionFilter):
     def _note_twist(self, rate: np.ndarray) -> None:
         """The camera's twist in its own frame, at that angular rate (3,)."""
         T_kc = self.step
-        lever = self._T_camera_imu[:3, 3]
-        self.twist = np.r_[T_kc[:3, :3].T @ self._velocity - np.cross(rate, lever), rate]
+        self.twist = np.r_[T_kc[:3, :3].T @ self._velocity - np.cross(rate, self._T_camera_imu[:3, 3]), rate]

@@ -22,8 +22,7 @@ def time_error(motion: MotionFilter, step: np.ndarray, interval: float, expected
     """
     least = (CHI_SQUARE_95 if expected else CHI_SQUARE_999)[1]
     departure, along = se3_log(step @ se3_inverse(motion.step)), motion.way(interval)
-    P = motion.predicted_covariance
-    weighted = np.linalg.lstsq(P, np.column_stack([departure, along]), rcond=1e-14)[0]
+    weighted = np.linalg.lstsq(motion.predicted_covariance, np.column_stack([departure, along]), rcond=1e-14)[0]
     (whole, across), (_, visible) = np.stack([departure, along]) @ weighted
     if visible <= least:
         return 0.0

@@ -47,8 +47,7 @@ def _views(
     View o of O sees the landmark in row `rows[owner[o]]` (K,) of the landmark table.
     """
     state, landmarks, views = window.posterior, window.landmarks, observations.views
-    anchor = landmarks.anchor[views.landmark]
-    pairs, pair = distinct(anchor * len(state) + observations.keyframe)
+    pairs, pair = distinct(landmarks.anchor[views.landmark] * len(state) + observations.keyframe)
     return {
         **window.graphs.constants(window.depth),
         "anchors": pairs // len(state),

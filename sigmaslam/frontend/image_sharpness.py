@@ -21,6 +21,11 @@ def sharpness(image: np.ndarray) -> float:
     return float(cv2.norm(cv2.Laplacian(smooth, cv2.CV_32F)) ** 2 / max(first, 1.0))
 
 
+def edge_energy(image: np.ndarray) -> float:
+    """Sum of the squared first derivatives of an (H, W) uint8 image: blur leaves little of it, and much less light."""
+    return float(sum(cv2.norm(cv2.Sobel(image, cv2.CV_32F, *axes, ksize=3)) ** 2 for axes in ((1, 0), (0, 1))))
+
+
 def patch_energies(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """(M, 2) energies of the first and second derivatives in patches of an image, grey values squared.
 

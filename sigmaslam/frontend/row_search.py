@@ -66,8 +66,7 @@ def align_in_rows(
         as of `disparity_slopes`.
     """
     refined, slope = refine_in_rows(left, right, points, start, reach)
-    level = np.abs(refined.places[:, 1] - points[:, 1]) <= ROW_TOLERANCE
-    return refined.places, refined.moved & level, slope
+    return refined.places, refined.moved & (np.abs(refined.places[:, 1] - points[:, 1]) <= ROW_TOLERANCE), slope
 
 
 def search_reference(

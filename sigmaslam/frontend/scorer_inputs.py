@@ -63,11 +63,9 @@ def nearest_matches(points0: np.ndarray, mutual: np.ndarray) -> np.ndarray:
     rows = np.arange(len(points0))[:, None]
     if len(anchors) < 2:
         return np.tile(rows, (1, NEIGHBOURS))
-    count = min(NEIGHBOURS + 1, len(anchors))
-    near = anchors[nearest_points(points0[anchors], points0, count)]
+    near = anchors[nearest_points(points0[anchors], points0, min(NEIGHBOURS + 1, len(anchors)))]
     # The match itself goes last, so that the first twelve are other matches if there are enough.
-    order = np.argsort(near == rows, axis=1, kind="stable")
-    near = np.take_along_axis(near, order, axis=1)[:, :NEIGHBOURS]
+    near = np.take_along_axis(near, np.argsort(near == rows, axis=1, kind="stable"), axis=1)[:, :NEIGHBOURS]
     missing = NEIGHBOURS - near.shape[1]
     return np.concatenate([near, np.tile(rows, (1, missing))], axis=1) if missing else near
 

@@ -27,8 +27,7 @@ def propagate(
     """
     covariance = np.broadcast_to(covariance, (*mean.shape, mean.shape[-1]))
     values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    columns = np.moveaxis(root, -1, 0) * _STEP
+    columns = np.moveaxis(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :], -1, 0) * _STEP
     middle = function(mean)
     plus, minus = function(mean + columns), function(mean - columns)
     slopes = (plus - minus) / (2.0 * _STEP)  # (n, ..., m)

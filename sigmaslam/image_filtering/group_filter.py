@@ -91,8 +91,7 @@ def _alike(guide: np.ndarray, ys: np.ndarray, xs: np.ndarray) -> np.ndarray:
         distances[k] = squares[at].ravel()
     nearest = np.argpartition(np.ascontiguousarray(distances.T), _MEMBERS, axis=1)[:, :_MEMBERS]
     steps = np.array([y * width + x for y, x in shifts])
-    centres = (ys[:, None] * width + xs).ravel()
-    return np.asarray(centres[:, None] + steps[nearest])
+    return np.asarray((ys[:, None] * width + xs).ravel()[:, None] + steps[nearest])
 
 
 def _grid(first: int, end: int) -> np.ndarray:

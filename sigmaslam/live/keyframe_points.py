@@ -44,6 +44,5 @@ class KeyframePoints:
         self._shown.update(tracks.landmark_id[rows].tolist())
         pixels = tracks.measurement[rows, :2]
         points = self.camera.triangulate(np.column_stack([pixels, disparity[rows]]))
-        last = np.array(frame.seen.left.shape[::-1]) - 1
-        u, v = np.clip(np.rint(pixels).astype(np.int64), 0, last).T
+        u, v = np.clip(np.rint(pixels).astype(np.int64), 0, np.array(frame.seen.left.shape[::-1]) - 1).T
         return transform_points(estimate.T_world_camera @ self.T_left_rectified, points), frame.seen.left[v, u]

@@ -139,8 +139,7 @@ class DepthPixels(Table):
             return self.select(kernels.thin(self.pixels, self.disparity, self.variance, *numbers))
         order, first = _groups(_voxels(self.points(camera), self.sigma(camera), size) @ _ONE_KEY)
         relative = (self.variance / self.disparity**2)[order]
-        count = np.diff(np.r_[first, len(order)])
-        best = relative == np.repeat(np.minimum.reduceat(relative, first), count)
+        best = relative == np.repeat(np.minimum.reduceat(relative, first), np.diff(np.r_[first, len(order)]))
         return self.select(np.sort(np.minimum.reduceat(np.where(best, order, len(order)), first)))
 
 

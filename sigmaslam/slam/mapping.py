@@ -120,7 +120,8 @@ class Mapper:
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
         is_bad = doubts.spoils_keyframe or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
-        if share >= ACCEPTANCE.bad_keyframe_landmarks and (is_bad or frame.is_blurred):
+        has_few, is_inertial = share < ACCEPTANCE.bad_keyframe_landmarks, self.motion.is_inertial
+        if (is_inertial and self.keyframes.is_faint(frame.left)) if has_few else (is_bad or frame.is_blurred):
             return None
         view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))

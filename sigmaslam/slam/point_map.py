@@ -58,8 +58,7 @@ class PointMap(Table):
             timestamp: seconds.
         """
         rows = self.timestamps == timestamp
-        last = np.array(image.shape[::-1]) - 1
-        u, v = np.clip(np.rint(self.pixels[rows]).astype(np.int64), 0, last).T
+        u, v = np.clip(np.rint(self.pixels[rows]).astype(np.int64), 0, np.array(image.shape[::-1]) - 1).T
         intensity = self.intensity.copy()
         intensity[rows] = image[v, u]
         return replace(self, intensity=intensity)

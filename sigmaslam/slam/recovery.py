@@ -74,6 +74,8 @@ class Recovery:
         since = timestamp - course.tracked_at
         if since <= config.lost_seconds or not self.admission.restarts_anywhere:
             return None
+        if self.status == dead_reckoning(self.motion) and self.keyframes.is_faint(view.left):
+            return None
         _LOGGER.warning("tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, since)
         if course.has_moved and dead_reckoning(self.motion) is None:
             course.resume(timestamp)

@@ -261,8 +261,7 @@ class _Fit:
     @classmethod
     def of(cls, rays: MatchedRays, probability: np.ndarray, R: np.ndarray, direction: np.ndarray) -> Self:
         at = _at(rays, R, direction)
-        near = soft_weight(at.squared)
-        usual = at.usual(probability * near)
+        usual = at.usual(probability * soft_weight(at.squared))
         cost = -2.0 * float((probability * usual * log_gain(at.squared)).sum())
         inliers = (at.squared < _GATE**2) & usual
         scale = max(1.0, float((at.residual[inliers] ** 2).sum()) / max(int(inliers.sum()) - 5, 1))

@@ -102,8 +102,7 @@ def are_one_place(apart: np.ndarray | np.floating) -> np.ndarray | np.bool_:
 
 def _are_alike(camera: RectifiedStereo, landmarks: np.ndarray, one: RelativePose, other: RelativePose) -> bool:
     """Whether both poses see most points at the same places."""
-    near = landmarks[:, 2] > 0.0
-    points = camera.triangulate(landmarks[near])
+    points = camera.triangulate(landmarks[landmarks[:, 2] > 0.0])
     first, second = (transform_points(se3_inverse(each.T_key_camera), points) for each in (one, other))
     front = (first[:, 2] > 0.0) & (second[:, 2] > 0.0)
     if not front.any():
