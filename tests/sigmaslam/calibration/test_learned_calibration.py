@@ -80,6 +80,9 @@ def test_what_is_wrong_by_the_evidence_is_corrected(name: str):
     focal, errors = StereoRectifier(given).rectified.fx, nearest_errors(given, true)
     share = float(errors[ERRORS.index(name)]) / focal
     estimate = CalibrationEstimate(float(errors[0]), 0.01, {}, {name: (1.0, share, 1e-4)})
-    left = np.abs(nearest_errors(learned_calibration(given, estimate, focal), true))
+    learned = learned_calibration(given, estimate, focal)
+    left = np.abs(nearest_errors(learned, true))
     assert left[1:7].max() < 0.1 * np.abs(errors[:7]).max()
     assert left[0] < 0.1 * np.abs(errors[:7]).max()
+    sigmas = dict(zip(learned.covariance.names, np.sqrt(np.diag(learned.covariance.matrix)), strict=True))
+    assert sigmas == {name: pytest.approx(1e-4), "offset": pytest.approx(0.01 / focal)}
