@@ -43,9 +43,9 @@ def compiled_folders(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def _timing(cpu_ms: float, version: str = "") -> MethodTiming:
-    """Of four frames, the last of which takes twice as long."""
-    time = [cpu_ms, cpu_ms, cpu_ms, 2 * cpu_ms]
-    return MethodTiming(time, time, 6, [], [], 0.5, 100.0, version)
+    """Of four frames, the last of which takes twice as long, and is ours a keyframe, and 0.6 J."""
+    time, keyframes = [cpu_ms, cpu_ms, cpu_ms, 2 * cpu_ms], [] if version else [False, False, False, True]
+    return MethodTiming(time, time, 6, [], [], 0.5, 100.0, version, keyframes, 0.6)
 
 
 def _run(method: str, threads: int, turn: int, timing: MethodTiming, section: str = SEQUENCE) -> TimedRun:
@@ -187,9 +187,18 @@ def test_the_page_has_means_over_frames_medians_over_rounds_and_ratios_within_th
     assert "3 rounds" in page
     assert "Peers: dim-odom 1.0." in page
     table, size = _rows(page, "ours")
-    assert table[1:7] == ["0 of 6", "0.0123", "75.0 (37.5 - 375.0)", "111.0", "3.00", "75.0 (37.5 - 375.0)"]
-    assert table[8:] == ["13.3", "100", "0.50"]  # 1 / (60 + 60 + 60 + 120) ms * 4
+    assert table[1:7] == [
+        "0 of 6",
+        "0.0123",
+        "75.0 (37.5 - 375.0)",
+        "60.0, 111.0, 118.2",
+        *["3.00", "75.0 (37.5 - 375.0)"],
+    ]
+    assert table[8:] == ["13.3", "100", "0.50", "100"]  # 1 / (60 + 60 + 60 + 120) ms * 4
     assert size == ["ours", "37.5"]
+    said = "1 keyframes 120.0 ms in the mean, 120.0, 120.0, 120.0; 3 others 60.0 ms in the mean, 60.0, 60.0, 60.0."
+    assert f"CPU, one thread, of ours: {said}" in page
+    assert "of cuVSLAM: " not in page
     assert _rows(page, "cuVSLAM")[0][5] == "1.00"
 
 

@@ -66,7 +66,7 @@ def format_runtime(results: Sequence[TimedRun | Omission], command: str, rounds:
         sequences=[_sequence([run for run in sections[SEQUENCE] if run.sequence == name]) for name in names],
         sizes=list(dict.fromkeys(run.variant for run in sections[SIZE])),
         size_rows=list(_size_rows(sections[SIZE])),
-        varied=next((run.sequence for run in sections[SIZE]), ""),
+        varied=" and ".join(dict.fromkeys(run.sequence for run in sections[SIZE])),
     )
 
 
@@ -82,7 +82,26 @@ def _sequence(runs: Sequence[TimedRun]) -> dict[str, Any]:
     return {
         "title": f"{runs[0].sequence}, {runs[0].variant}, {runs[0].timing.frames} frames",
         "rows": [_row(method, runs) for method in methods],
+        "keyframes": [_keyframes(method, runs) for method in methods if any(_marked(method, runs))],
     }
+
+
+def _marked(method: str, runs: Sequence[TimedRun]) -> list[TimedRun]:
+    """Runs of a method on one thread that say which frames became keyframes."""
+    return [run for run in runs if (run.method, run.threads) == (method, 1) and any(run.timing.keyframes)]
+
+
+def _keyframes(method: str, runs: Sequence[TimedRun]) -> str:
+    """What keyframes took, and other frames, in a sentence."""
+    marked, parts = _marked(method, runs), []
+    for name, kind in (("keyframes", True), ("others", False)):
+
+        def of_kind(run: TimedRun, kind: bool = kind) -> np.ndarray:
+            return np.array(run.timing.cpu_ms)[np.array(run.timing.keyframes) == kind]
+
+        mean = _middle(marked, lambda run: float(of_kind(run).mean()), ".1f")
+        parts.append(f"{len(of_kind(marked[0]))} {name} {mean} ms in the mean, {_percentiles(marked, of_kind)}")
+    return f"{method_label(method)}: {'; '.join(parts)}"
 
 
 def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
@@ -96,13 +115,14 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
         f"{tracked} of {of_method[0].timing.frames}",
         number(float(np.median([run.ate for run in of_method])), ".4f"),
         _spread(one, _mean_cpu, ".1f"),
-        _middle(one, lambda run: float(np.percentile(run.timing.cpu_ms, 95)), ".1f"),
+        _percentiles(one, lambda run: np.array(run.timing.cpu_ms)),
         number(float(np.median(ratios)) if ratios else np.nan, ".2f"),
         _spread(two, lambda run: float(np.mean(run.timing.wall_ms)), ".1f"),
         _middle(two, lambda run: float(np.percentile(run.timing.wall_ms, 95)), ".1f"),
         _middle(two, lambda run: 1e3 / float(np.mean(run.timing.wall_ms)), ".1f"),
         _middle(two, lambda run: run.timing.peak_mib, ".0f"),
         _middle(two, lambda run: run.timing.first_pose_s, ".2f"),
+        _middle(one, lambda run: 1e3 * run.timing.joules / run.timing.frames, ".0f"),
     ]
 
 
@@ -122,6 +142,15 @@ def _mean_cpu(run: TimedRun) -> float:
 def _middle(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form: str) -> str:
     """Median over the rounds."""
     return number(float(np.median([measure(run) for run in runs])) if runs else np.nan, form)
+
+
+def _percentiles(runs: Sequence[TimedRun], times: Callable[[TimedRun], np.ndarray]) -> str:
+    """Median, and what 95 % and 99 % of the frames stay below; medians over the rounds."""
+
+    def below(share: float) -> str:
+        return _middle(runs, lambda run: float(np.percentile(times(run), share)), ".1f")
+
+    return ", ".join(map(below, (50, 95, 99)))
 
 
 def _spread(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form: str) -> str:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -58,6 +58,8 @@ class MethodTiming:
         first_pose_s: from the start of the process to the pose of the second frame; NaN without one.
         peak_mib: largest resident memory.
         version: of a peer's package.
+        keyframes: (N,) whether the frame became a keyframe; empty where a method does not say.
+        joules: that the processor took for all frames; NaN where the machine does not tell.
     """
 
     cpu_ms: list[float]
@@ -68,6 +70,8 @@ class MethodTiming:
     first_pose_s: float
     peak_mib: float
     version: str = ""
+    keyframes: list[bool] = field(default_factory=list)
+    joules: float = float("nan")
 
 
 class FailedMethodError(SigmaSlamError):
@@ -79,6 +83,7 @@ class _Method(Protocol):
 
     rectified: bool
     version: str
+    keyframes: list[bool]
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None: ...
 
@@ -123,7 +128,7 @@ def run_job(job: TimingJob, started: float) -> MethodTiming:
     pairs = open_pairs(Path(job.pairs))
     method = _open(job, pairs)
     poses, walls, own, others = [], [], [], []
-    first_pose = float("nan")
+    first_pose, energy = float("nan"), _joules()
     for index, timestamp in enumerate(pairs.timestamps):
         left, right = pairs.read(index, method.rectified)
         others.append(_other_threads())
@@ -136,7 +141,7 @@ def run_job(job: TimingJob, started: float) -> MethodTiming:
         poses.append(pose)
     # Threads in the background go on while the next pair is read.
     cpus = np.array(own) + np.diff([*others, _other_threads()])
-    peak = _peak_mib()
+    peak, energy = _peak_mib(), _joules() - energy
     method.close()
     tracked = [(time, pose) for time, pose in zip(pairs.timestamps, poses, strict=True) if pose is not None]
     return MethodTiming(
@@ -148,6 +153,8 @@ def run_job(job: TimingJob, started: float) -> MethodTiming:
         first_pose_s=first_pose,
         peak_mib=peak,
         version=method.version,
+        keyframes=method.keyframes[WARM_UP:],
+        joules=energy,
     )
 
 
@@ -166,10 +173,12 @@ class _Ours:
         from sigmaslam.slam.tracker import StereoTracker
 
         self.version = ""
+        self.keyframes: list[bool] = []
         self._tracker = StereoTracker(pairs.camera, OURS[job.method], threads=job.threads)
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
         estimate = self._tracker.step(left, right, timestamp)
+        self.keyframes.append(estimate.tracks is not None)
         return estimate.T_world_camera if estimate.has_pose and estimate.status not in ("lost", "skipped") else None
 
     def close(self) -> None:
@@ -183,6 +192,7 @@ class _Peer:
         # It is the only one of this process, whose time and memory are measured.
         self._peer = open_peer(name, camera, pairs.timestamps, own_process=False)
         self.version = self._peer.version
+        self.keyframes: list[bool] = []
 
     def step(self, left: np.ndarray, right: np.ndarray, timestamp: float) -> np.ndarray | None:
         step = self._peer.step(left, right, timestamp)
@@ -201,6 +211,14 @@ def _hold_on_cores(count: int) -> None:
 def _other_threads() -> float:
     """CPU seconds so far of all threads but this one."""
     return time.process_time() - time.thread_time()
+
+
+def _joules() -> float:
+    """That the processor's first package has taken so far, by Intel's counter; NaN where there is none to read."""
+    try:
+        return 1e-6 * int(Path("/sys/class/powercap/intel-rapl:0/energy_uj").read_text(encoding="ascii"))
+    except OSError:
+        return float("nan")
 
 
 def _milliseconds(seconds: Iterable[float]) -> list[float]:
