@@ -156,8 +156,7 @@ def compare_with_neighbours(
         apart = predicted[near] - predicted[:, None]
         neighbours[..., 0] += np.einsum("mkj,mj->mk", apart, slope)
     usual = np.median(neighbours, axis=1)
-    spread = np.median(np.linalg.norm(neighbours - usual[:, None], axis=2), axis=1)
-    return departure - usual, spread
+    return departure - usual, np.median(np.linalg.norm(neighbours - usual[:, None], axis=2), axis=1)
 
 
 def _align(image0: Images, image1: np.ndarray, targets: PatchTargets, start: np.ndarray) -> AlignedPatches:

@@ -53,8 +53,7 @@ def nearest_anywhere(descriptors0: np.ndarray, descriptors1: np.ndarray) -> Puta
     second = similarity.max(axis=1)
     similarity[rows, index1] = best1
     similarity[index0, columns] = _NO_SIMILARITY
-    runner_up = similarity.max(axis=0)
-    other = np.where(index0[index1] == rows, runner_up[index1], best0[index1])
+    other = np.where(index0[index1] == rows, similarity.max(axis=0)[index1], best0[index1])
     return Putative(rows, index1, best1, second, other)
 
 

@@ -13,7 +13,7 @@ from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.marginalised_poses import step_between
 from sigmaslam.estimation.published_state import published_state, with_shown_errors
 from sigmaslam.frontend import StereoView
-from sigmaslam.frontend.image_sharpness import edge_energy, patch_energies
+from sigmaslam.frontend.image_sharpness import patch_energies
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.slam.appearance import AppearanceIndex
 from sigmaslam.slam.hanging_keyframes import hang_over
@@ -32,8 +32,6 @@ from sigmaslam.slam.point_map import (
 
 # Patches that are compared for blur: in the mean of so many what single ones show of the scene evens out.
 _COMPARED = 30
-# Defocus by 2 pixels leaves a quarter of the energy of edges; within five frames good recordings have 0.41 at least.
-_FAINT = 0.25
 # Poses that are remembered together; time and memory of their joint covariance grow with the square.
 _REMEMBERED = 60
 # What is as well known relative to many of them, as after a loop, hangs at a near one: by the drift of a good track.
@@ -117,13 +115,6 @@ class Keyframes:
         share = float(here[1] * energies[0] / reference) if reference > 0.0 else 1.0
         own = 1.0 if share >= ACCEPTANCE.sharpness else 1.0 / max(share, ACCEPTANCE.least_sharpness)
         return own, own + float(blurs.mean()) - 1.0
-
-    def is_faint(self, left: np.ndarray) -> bool:
-        """Whether edges of an image (H, W) uint8 are much weaker than those of the last keyframe: out of focus, say.
-
-        A sensor of motion goes on better without what little such images show.
-        """
-        return bool(self.active) and edge_energy(left) < _FAINT * edge_energy(self.active[-1].view.left)
 
     def marginalise_oldest(self, spare: KnownKeyframe | None = None) -> np.ndarray:
         """Moves the oldest keyframe to the past, and its landmarks to the map.

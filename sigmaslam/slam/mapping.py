@@ -5,13 +5,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
-from sigmaslam.estimation.constant_velocity import MotionFilter
+from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.estimation.landmark_table import LandmarkViews
 from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
 from sigmaslam.frontend import StereoView
 from sigmaslam.frontend.feature_spacing import select_spaced
+from sigmaslam.frontend.image_sharpness import is_defocused
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
@@ -120,8 +121,11 @@ class Mapper:
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
         is_bad = doubts.spoils_keyframe or (blur > 1.0 and fit.nis_before_scaling > ACCEPTANCE.scattered_nis)
-        has_few, is_inertial = share < ACCEPTANCE.bad_keyframe_landmarks, self.motion.is_inertial
-        if (is_inertial and self.keyframes.is_faint(frame.left)) if has_few else (is_bad or frame.is_blurred):
+        has_few, last = share < ACCEPTANCE.bad_keyframe_landmarks, self.keyframes.active[-1].view.left
+        if not has_few and (is_bad or frame.is_blurred):
+            return None
+        # A sensor of motion goes on better without what little such images show.
+        if has_few and dead_reckoning(self.motion) is not None and is_defocused(frame.left, last):
             return None
         view = frame.view
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
@@ -142,7 +146,7 @@ class Mapper:
             covariance = shared[:, None] * covariance * shared
             if doubts.prediction_is_wrong:  # as after a sample gone wrong: it would bend the window
                 step = fit.step
-        # Streaks hide what moves, and it draws the pose: frames that see the keyframe's landmarks share that.
+        # What moves draws the pose, hidden by streaks or not: frames that see the keyframe's landmarks share that.
         drawn = 0.0 if Doubt.TIME in doubts.reasons else doubts.spread  # the image's own pose knows of no stamp
         spread = (matches.streaked or doubts.is_ambiguous) * drawn
         spread = spread + matches.streaked * (1.0 - 1.0 / fit.clustering) * fit.relative

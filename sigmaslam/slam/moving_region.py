@@ -41,9 +41,10 @@ class MovingRegion:
         self._left = left
 
     def keep_if_seen_from(self, pose: np.ndarray, camera: RectifiedStereo) -> None:
-        """Forgets all places but if at least half are nearer to where `pose` (4, 4) sees their points than to rest."""
-        apart = np.linalg.norm(self._seen_from(pose, camera)[0] - self._places, axis=1)
-        moves = apart < np.linalg.norm(self._departure, axis=1)
+        """Forgets all places unless at least half are nearer to where `pose` (4, 4) sees their points than to rest."""
+        there, front = self._seen_from(pose, camera)
+        apart = np.linalg.norm(there - self._places, axis=1)
+        moves = front & (apart < np.linalg.norm(self._departure, axis=1))
         self._keep(np.full(len(moves), 2 * moves.sum() >= len(moves)))
 
     def _seen_from(self, pose: np.ndarray, camera: RectifiedStereo) -> tuple[np.ndarray, np.ndarray]:

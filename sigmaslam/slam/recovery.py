@@ -10,6 +10,7 @@ from sigmaslam.estimation.calibration_correction import change_rig
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
 from sigmaslam.frontend import StereoView
+from sigmaslam.frontend.image_sharpness import is_defocused
 from sigmaslam.geometry.se3 import se3_body, se3_inverse, se3_log, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.frame import Frame
@@ -74,7 +75,8 @@ class Recovery:
         since = timestamp - course.tracked_at
         if since <= config.lost_seconds or not self.admission.restarts_anywhere:
             return None
-        if self.status == dead_reckoning(self.motion) and self.keyframes.is_faint(view.left):
+        active, is_reckoned = self.keyframes.active, self.status == dead_reckoning(self.motion)
+        if is_reckoned and active and is_defocused(view.left, active[-1].view.left):
             return None
         _LOGGER.warning("tracking starts anew at %.3f s, %.2f s after the last pose", timestamp, since)
         if course.has_moved and dead_reckoning(self.motion) is None:

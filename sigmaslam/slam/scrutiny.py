@@ -73,7 +73,8 @@ class Scrutiny:
         for region in (moving, self._rival):
             if region is not None:
                 region.carry(left, fit.pose, self._window.camera)
-        self._rival.keep_if_seen_from(self._parting @ self._T_rival_fit @ fit.pose, self._window.camera)
+        if self._rival:
+            self._rival.keep_if_seen_from(self._parting @ self._T_rival_fit @ fit.pose, self._window.camera)
         second = None if moving is None else find_scene_behind(self._localiser, matches, fit, doubts)
         second = second or find_second_motion(self._window, matches, fit, moving)
         for _ in range(_MOST_MOVERS):

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from threading import Lock
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,7 @@ class StereoTracker:
         right_delay: float = 0.0,
     ) -> None:
         check_tracker_arguments(camera, frontend, backend, config, threads, weights, right_delay)
-        self._turn, self._delay, self.config = Lock(), right_delay, (config := config or TrackerConfig())
+        self._turn, self._delay, self.config = RLock(), right_delay, (config := config or TrackerConfig())
         networks = config.max_keypoints, backend, threads, provider, weights
         load: Callable[[], Frontend] = partial(build_frontend, frontend, *networks)
         if threads > 1:  # beside all else that a start needs

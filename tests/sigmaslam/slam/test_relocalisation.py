@@ -599,7 +599,7 @@ def test_results_may_be_taken_while_another_thread_steps(demo: Demo):
     tracker, taken, ended = StereoTracker(camera, threads=1), [], Event()
 
     def take():
-        while not ended.is_set():
+        while not ended.wait(0.01):
             final, covariances = tracker.final_trajectory()
             taken.append(len(final) == len(covariances))
             tracker.map()
@@ -607,9 +607,11 @@ def test_results_may_be_taken_while_another_thread_steps(demo: Demo):
 
     with ThreadPoolExecutor(1) as pool:
         reading = pool.submit(take)
-        for frame in frames[:12]:
-            tracker.step(frame.left, frame.right, frame.timestamp)
-        ended.set()
+        try:
+            for frame in frames[:12]:
+                tracker.step(frame.left, frame.right, frame.timestamp)
+        finally:
+            ended.set()
         reading.result()
     assert taken
     assert all(taken)
