@@ -11,7 +11,7 @@ from sigmaslam.calibration.calibrate import BoardCalibration
 from sigmaslam.calibration.lens_choice import folds
 from sigmaslam.calibration.tracker_covariance import tracker_covariance
 from sigmaslam.calibration_files.calibration_writer import camera_entries, write_calibration
-from sigmaslam.files import atomic_write_text, save_png
+from sigmaslam.files import atomic_path, atomic_write_text
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.plot_style import BLUE, GREY, VERMILLION, style_axes
 
@@ -125,7 +125,8 @@ def draw_board_calibration(path: Path, result: BoardCalibration) -> None:
         style_axes(grid[1, k])
         grid[1, k].set(ylabel="rms, px", xticks=range(len(result.names)))
         grid[1, k].set_xticklabels([each.split(" + ")[0] for each in result.names], rotation=90, fontsize=7)
-    save_png(figure, path)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=100)
 
 
 def _draw_corners(axes: "Axes", result: BoardCalibration, k: int, eye: CameraModel) -> None:

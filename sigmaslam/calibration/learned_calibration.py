@@ -29,7 +29,8 @@ def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, foca
     if "lenses" in shares and right.distortion_model != "equidistant":
         first, *others = right.distortion or (0.0,) * 4
         right = replace(right, distortion_model="radtan", distortion=(first - shares["lenses"], *others))
-    variances = {name: sigma**2 for name, (_, _, sigma) in learned.causes.items()}
+    left_alone = "lenses" if right.distortion_model == "equidistant" else ""
+    variances = {name: sigma**2 for name, (_, _, sigma) in learned.causes.items() if name != left_alone}
     variances["offset"] = (learned.disparity_offset_sigma / focal_length) ** 2
     T_left_right = camera.T_left_right.copy()
     T_left_right[:3, :3] = T_left_right[:3, :3] @ cv2.Rodrigues(np.array([0.0, yaw, 0.0]))[0]

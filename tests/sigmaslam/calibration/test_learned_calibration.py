@@ -71,6 +71,13 @@ def test_learning_once_more_keeps_what_else_is_known():
     assert replace(twice, covariance=once.covariance).right.cx == pytest.approx(once.right.cx - 0.01)
 
 
+def test_a_lens_that_cannot_be_corrected_is_as_unknown_as_before():
+    learned = learned_calibration(
+        raw_rig("equidistant"), CalibrationEstimate(0.0, 0.05, {}, {"lenses": (1.0, 0.01, 1e-4)}), 450.0
+    )
+    assert learned.covariance.names == ("offset",)
+
+
 @pytest.mark.parametrize("name", ["yaw", "zoom", "lenses"])
 def test_what_is_wrong_by_the_evidence_is_corrected(name: str):
     """The errors of a pair that is given with one, as a run with no noise would find them, leave the true pair."""
