@@ -82,7 +82,7 @@ def _sequence(runs: Sequence[TimedRun]) -> dict[str, Any]:
     return {
         "title": f"{runs[0].sequence}, {runs[0].variant}, {runs[0].timing.frames} frames",
         "rows": [_row(method, runs) for method in methods],
-        "keyframes": [_keyframes(method, runs) for method in methods if any(_marked(method, runs))],
+        "keyframes": [row for method in methods for row in _keyframes(method, runs)],
     }
 
 
@@ -91,17 +91,15 @@ def _marked(method: str, runs: Sequence[TimedRun]) -> list[TimedRun]:
     return [run for run in runs if (run.method, run.threads) == (method, 1) and any(run.timing.keyframes)]
 
 
-def _keyframes(method: str, runs: Sequence[TimedRun]) -> str:
-    """What keyframes took, and other frames, in a sentence."""
-    marked, parts = _marked(method, runs), []
+def _keyframes(method: str, runs: Sequence[TimedRun]) -> list[list[str]]:
+    """What keyframes took, and other frames: rows of a table."""
+    marked, rows = _marked(method, runs), []
     for name, kind in (("keyframes", True), ("others", False)):
-
-        def of_kind(run: TimedRun, kind: bool = kind) -> np.ndarray:
-            return np.array(run.timing.cpu_ms)[np.array(run.timing.keyframes) == kind]
-
-        mean = _middle(marked, lambda run: float(of_kind(run).mean()), ".1f")
-        parts.append(f"{len(of_kind(marked[0]))} {name} {mean} ms in the mean, {_percentiles(marked, of_kind)}")
-    return f"{method_label(method)}: {'; '.join(parts)}"
+        chosen = [np.array(run.timing.cpu_ms)[np.array(run.timing.keyframes) == kind] for run in marked]
+        if chosen and all(map(len, chosen)):
+            mean = number(float(np.median([each.mean() for each in chosen])), ".1f")
+            rows.append([f"{method_label(method)}, {name}", f"{len(chosen[0])}", mean, _percentiles(chosen)])
+    return rows
 
 
 def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
@@ -115,7 +113,7 @@ def _row(method: str, runs: Sequence[TimedRun]) -> list[str]:
         f"{tracked} of {of_method[0].timing.frames}",
         number(float(np.median([run.ate for run in of_method])), ".4f"),
         _spread(one, _mean_cpu, ".1f"),
-        _percentiles(one, lambda run: np.array(run.timing.cpu_ms)),
+        _percentiles([np.array(run.timing.cpu_ms) for run in one]),
         number(float(np.median(ratios)) if ratios else np.nan, ".2f"),
         _spread(two, lambda run: float(np.mean(run.timing.wall_ms)), ".1f"),
         _middle(two, lambda run: float(np.percentile(run.timing.wall_ms, 95)), ".1f"),
@@ -144,13 +142,10 @@ def _middle(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form
     return number(float(np.median([measure(run) for run in runs])) if runs else np.nan, form)
 
 
-def _percentiles(runs: Sequence[TimedRun], times: Callable[[TimedRun], np.ndarray]) -> str:
+def _percentiles(times: Sequence[np.ndarray]) -> str:
     """Median, and what 95 % and 99 % of the frames stay below; medians over the rounds."""
-
-    def below(share: float) -> str:
-        return _middle(runs, lambda run: float(np.percentile(times(run), share)), ".1f")
-
-    return ", ".join(map(below, (50, 95, 99)))
+    shares = np.array([np.percentile(each, (50, 95, 99)) for each in times]).reshape(-1, 3)
+    return ", ".join(f"{each:.1f}" for each in np.median(shares, axis=0)) if len(shares) else "-"
 
 
 def _spread(runs: Sequence[TimedRun], measure: Callable[[TimedRun], float], form: str) -> str:

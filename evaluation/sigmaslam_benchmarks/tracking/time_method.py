@@ -154,7 +154,7 @@ def run_job(job: TimingJob, started: float) -> MethodTiming:
         peak_mib=peak,
         version=method.version,
         keyframes=method.keyframes[WARM_UP:],
-        joules=energy,
+        joules=energy if energy >= 0.0 else float("nan"),  # the counter begins anew
     )
 
 
