@@ -250,8 +250,7 @@ def degree_of_belief(covariance: Tensor) -> Tensor:
     partial = finite & (norm > 0) & (norm < 1)
     inside = 1.0 - torch.where(partial, norm, 1.0).sqrt()
     certain = finite & (norm == 0)
-    belief = torch.where(partial, inside, certain.to(inside.dtype))
-    return torch.where(is_nan, torch.nan, belief)
+    return torch.where(is_nan, torch.nan, torch.where(partial, inside, certain.to(inside.dtype)))
 
 
 def _of_batch(index: Any, trailing: int) -> tuple[Any, ...]:

@@ -84,8 +84,7 @@ class WheeledRobot:
             rates[0] ** 2 * duration + rates[1] ** 2 * path[..., i].abs()
             for i, rates in enumerate((self.noise.drive, self.noise.turn))
         ]
-        noise = Diagonal(torch.stack(variance, dim=-1))
-        return MotionModel(_drive, noise, additive=False)
+        return MotionModel(_drive, Diagonal(torch.stack(variance, dim=-1)), additive=False)
 
     def measurement(self) -> MeasurementModel:
         """Sighting of one landmark (..., 2), of unit noise."""
@@ -98,8 +97,7 @@ class WheeledRobot:
         """Variances (..., 2) of sightings (..., 2), from the distance that was measured."""
         constant, share = self.noise.distance
         if self.kind == "cartesian":
-            squared = value.square().sum(dim=-1, keepdim=True)
-            return (constant**2 + share**2 * squared).expand_as(value)
+            return (constant**2 + share**2 * value.square().sum(dim=-1, keepdim=True)).expand_as(value)
         distance = constant**2 + (share * value[..., 0]) ** 2
         return torch.stack([distance, torch.full_like(distance, self.noise.bearing**2)], dim=-1)
 

@@ -10,7 +10,7 @@ from sigmaslam.cli.run_summary import tell_summary
 
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Run folder of `sigmaslam track`, or up to six.")],
-    out: Annotated[Path | None, typer.Option(help="Page; RUN/report.html, of several comparison.html.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Page; by default RUN/report.html, or comparison.html.")] = None,
 ) -> None:
     """Make report.html of a run anew, or one page that compares several runs.
 

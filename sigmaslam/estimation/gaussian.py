@@ -59,8 +59,7 @@ def step_with(covariance: np.ndarray, part: slice, index: int, change: float) ->
 def at_most(covariance: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """The covariance (n, n), cut in the directions in which it is larger than another one, which is regular."""
     root = np.linalg.cholesky(limit)
-    half = np.linalg.solve(root, covariance)
-    values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
+    values, vectors = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, covariance).T))
     cut = root @ vectors
     return np.asarray((cut * np.minimum(values, 1.0)) @ cut.T)
 

@@ -43,8 +43,8 @@ class CameraModel:
         distortion: coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]] for 'radtan', k1 k2 k3 k4 for 'equidistant'.
 
     Raises:
-        CalibrationError: a size or focal length is not positive or too large, a value is not finite, or the number of
-            coefficients does not fit the model.
+        CalibrationError: a size or focal length is not positive or too large, a size not whole, a value not finite, or
+            the number of coefficients does not fit the model.
     """
 
     width: int
@@ -64,7 +64,7 @@ class CameraModel:
         if not all(0 < side <= MAX_SIDE and side % 1 == 0 for side in (self.width, self.height)):
             size = f"{self.width:.6g}x{self.height:.6g}"
             raise CalibrationError(f"image size is {size}; sides must be whole numbers from 1, and at most {MAX_SIDE}")
-        for name in ("width", "height", "fx", "fy", "cx", "cy", "skew"):  # those of numpy are none of YAML
+        for name in ("width", "height", "fx", "fy", "cx", "cy", "skew"):  # YAML cannot write numpy's numbers
             object.__setattr__(self, name, (int if name in ("width", "height") else float)(getattr(self, name)))
         numbers = (self.fx, self.fy, self.cx, self.cy, self.skew, *self.distortion)
         if not np.all(np.isfinite(numbers)):

@@ -201,8 +201,7 @@ def se3_log(T: np.ndarray) -> np.ndarray:
     second = np.where(angle > 0.1, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2, series)
     cross = skew(phi)
     inverse_jacobian = np.eye(3) - 0.5 * cross + second * (cross @ cross)
-    rho = (inverse_jacobian @ T[..., :3, 3:])[..., 0]
-    return np.concatenate([rho, phi], axis=-1)
+    return np.concatenate([(inverse_jacobian @ T[..., :3, 3:])[..., 0], phi], axis=-1)
 
 
 def _exp_of_one(rho: np.ndarray, phi: np.ndarray) -> np.ndarray:

@@ -17,7 +17,8 @@ _DISABLED = ["MatMulScaleFusion"]
 
 def installed_providers() -> list[str]:
     """Names of `PROVIDERS` that the installed ONNX Runtime has."""
-    return [name for name, provider in PROVIDERS.items() if provider in onnxruntime.get_available_providers()]
+    available = onnxruntime.get_available_providers()
+    return [name for name, provider in PROVIDERS.items() if provider in available]
 
 
 def check_provider(provider: str, backend: str = "onnx") -> None:

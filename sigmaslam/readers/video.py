@@ -84,7 +84,7 @@ def open_video(path: Path, calibration: Path | None = None) -> StereoSequence:
     else:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             raise InputError(f"{path}: an image, not a video; give the folder that has the left and right images")
-        if path in (find_videos(path.parent) or ()):
+        if path.stem in ("left", "right") and find_videos(path.parent):
             raise InputError(f"{path}: is the video of one eye, the other lies beside it: give the folder")
         pairs, folder = VideoPairs(path), path.parent
     camera = beside_calibration(folder, calibration, common_size(pairs.first_pair), zed_export=path.is_file())

@@ -48,7 +48,7 @@ def judge(run: RecordedRun) -> State:
     findings = wrong([Finding(**each) for each in (*run.entries.get("checks", ()), *run.summary.get("imu", ()))])
     notices += [("warn", f"{each.name}: {each.message}") for each in findings if each.message not in (failure or "")]
     if hint := run.evaluation.get("truth_hint"):
-        notices.append(("warn", f"Errors are of no use: the truth looks like {hint}."))
+        notices.append(("warn", f"The truth looks like {hint}."))
     verdict = run.evaluation.get("nees_verdict")
     if verdict and verdict["kind"] == "warn":
         notices.append(("warn", verdict["text"]))

@@ -43,7 +43,8 @@ def pack_relative_poses(frame: int, relative: RelativePoses) -> bytes:
 def collect_frame_pairs(folder: Path, timestamps: np.ndarray) -> FramePairs:
     """The relative poses in the folder of a run so far, whose poses were tracked with time stamps (N,), seconds."""
     columns = read_rows(folder / PARTIAL_RELATIVE_POSES, (), (), (), (4, 4), (6, 6))
-    later, span, earlier_time, pose, covariance = (column[columns[0] < len(timestamps)] for column in columns)
+    known = columns[0] < len(timestamps)
+    later, span, earlier_time, pose, covariance = (column[known] for column in columns)
     # The nearest: time stamps that were read from trajectory.tum are rounded.
     earlier = nearest_rows(earlier_time, timestamps)
     return FramePairs(np.array(SPANS)[span.astype(np.int64)], earlier, later.astype(np.int64), pose, covariance)

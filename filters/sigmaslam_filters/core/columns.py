@@ -92,5 +92,4 @@ def block_diagonal(first: Tensor, second: Tensor) -> Tensor:
     n, q = first.shape[-1], second.shape[-1]
     batch = torch.broadcast_shapes(first.shape[:-2], second.shape[:-2])
     upper = torch.nn.functional.pad(first, (0, q)).expand(*batch, n, n + q)
-    lower = torch.nn.functional.pad(second, (n, 0)).expand(*batch, q, n + q)
-    return torch.cat([upper, lower], dim=-2)
+    return torch.cat([upper, torch.nn.functional.pad(second, (n, 0)).expand(*batch, q, n + q)], dim=-2)

@@ -221,5 +221,4 @@ def _masked(covariance: Tensor, mask: Tensor) -> Tensor:
 
 def _block_diagonal(blocks: Tensor) -> Tensor:
     on_diagonal = identity(blocks.shape[-3], blocks)[:, None, :, None]
-    spread = on_diagonal * blocks.unsqueeze(-2)
-    return spread.flatten(-4, -3).flatten(-2, -1)
+    return (on_diagonal * blocks.unsqueeze(-2)).flatten(-4, -3).flatten(-2, -1)

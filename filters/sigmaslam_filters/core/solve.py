@@ -133,8 +133,7 @@ def solve(form: Form, innovation: Tensor, columns: Columns, noise: Noise | None,
         raise ValueError("the noise of the measurement is not additive, but no deviation comes from it")
     parts = [odd, innovation.unsqueeze(-1)] if even is None else [even, odd, innovation.unsqueeze(-1)]
     white = noise.whitened(join(parts))
-    solver = _qr if form == "qr" else _low_rank
-    return solver(white, prior, noise)
+    return (_qr if form == "qr" else _low_rank)(white, prior, noise)
 
 
 def _dense(innovation: Tensor, columns: Columns, noise: Noise | None, prior: Tensor) -> TangentPosterior:

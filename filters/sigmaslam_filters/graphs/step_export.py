@@ -99,7 +99,7 @@ def export_step(
     Raises:
         ExportError: the models use something that ONNX or ONNX Runtime lacks, or the graph differs from torch by more
             than `TOLERANCES`. Nothing is written.
-        ValueError: the example does not fit the models, or the name ends otherwise.
+        ValueError: the example does not fit the models, or `path` ends in neither .onnx nor .hpp.
     """
     path = Path(path)
     if path.suffix not in (".onnx", ".hpp"):

@@ -91,5 +91,4 @@ def adjoint_se3(transform: Tensor) -> Tensor:
     """Matrix that carries a twist through a rigid motion, (..., 4, 4) -> (..., 6, 6)."""
     R, t = transform[..., :3, :3], transform[..., :3, 3]
     upper = torch.cat([R, skew(t) @ R], dim=-1)
-    lower = torch.cat([torch.zeros_like(R), R], dim=-1)
-    return torch.cat([upper, lower], dim=-2)
+    return torch.cat([upper, torch.cat([torch.zeros_like(R), R], dim=-1)], dim=-2)

@@ -26,6 +26,7 @@ function buildPlot(box, seconds, intervals, plot, select) {
   const clean = (values) => Array.from(values, (value) => (Number.isFinite(value) && (!plot.log || value > 0) ? value : null));
   const write = (_, value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(4)).toString());
   const axis = { stroke: soft, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 } };
+  const upright = { ...axis, size: 62, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : write(_, tick))) };
   const series = plot.series.map((each) => ({
     label: each.label, stroke: each.colour, width: each.width ?? 1.5, dash: each.dash, fill: each.fill, value: write, class: each.label ? undefined : "nameless",
     points: { show: Boolean(each.dots), size: 4, fill: each.dots ? each.colour : undefined }, paths: each.dots ? () => null : undefined, spanGaps: false,
@@ -33,7 +34,7 @@ function buildPlot(box, seconds, intervals, plot, select) {
   const options = {
     width: box.clientWidth, height: 230, cursor: { sync: { key: "run" } },
     scales: { x: { time: false }, y: plot.log ? { distr: 3 } : { range: plot.range } },
-    series: [{ label: "time [s]", value: write }, ...series], bands: plot.bands, axes: [axis, { ...axis, size: 62, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : write(_, tick))) }],
+    series: [{ label: "time [s]", value: write }, ...series], bands: plot.bands, axes: [axis, upright],
     hooks: { drawClear: [shadeStatuses(intervals)] },
   };
   if (!plot.log && !plot.range) delete options.scales.y;
