@@ -65,7 +65,7 @@ def find_board_images(paths: Sequence[Path]) -> list[BoardImages]:
         moments = max(kinds, key=lambda each: sum(map(all, each.values())))
         pairs = sum(map(all, moments.values()))
         if len(told) < len(files):
-            untold += [file for file, name in names if 2 * pairs > 2 and len(files) <= 4 * pairs and name is None]
+            untold += [file for file, name in names if pairs > 1 and len(files) <= 4 * pairs and name is None]
             continue
         if pairs:
             # 2 comes before 10.

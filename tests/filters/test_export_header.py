@@ -58,8 +58,11 @@ def test_a_program_with_the_header_follows_a_robot_as_torch_does(make, dtype, tm
     tolerance = 1e-12 if dtype == torch.float64 else 1e-4
     assert filters.export_step(bayes, drive, see, example, tmp_path / "robot.hpp", gate=0.999) < tolerance
     text = (tmp_path / "robot.hpp").read_text()
-    included = {line for line in text.splitlines() if line.startswith("#") and "include" in line}
-    assert included == {"#include <cmath>", "#include <cstdint>"}
+    assert {line for line in text.splitlines() if line.startswith("#")} == {
+        "#pragma once", "#include <cmath>", "#include <cstdint>",
+        "#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__", "#endif",
+        '#error "NaN is a missing value: compile without -ffast-math, or with -fno-finite-math-only after it"',
+    }  # fmt: skip
     assert not {"new ", "malloc", "std::vector"} & {word for word in ("new ", "malloc", "std::vector") if word in text}
     (tmp_path / "main.cpp").write_text(PROGRAM)
     flags = ["-std=c++17", "-O1", "-Wall", "-Werror", "-Wno-unused-variable", "-o", "robot"]
