@@ -15,6 +15,7 @@ from sigmaslam.checks.inertial_agreement import check_motion
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
 from sigmaslam.checks.time_stamps import check_time_stamps
+from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers.stereo_sequence import FrameStep, StereoSequence
 
@@ -38,12 +39,14 @@ class Check:
         steps: the frames that were looked at.
         rectified: left and right (H, W) uint8 of the first frame of each.
         matches: between these.
+        camera: without what is wrong with its rows, to track by.
     """
 
     findings: list[Finding]
     steps: list[FrameStep]
     rectified: list[tuple[np.ndarray, np.ndarray]]
     matches: EyeMatches
+    camera: StereoCamera
 
 
 def check_sequence(
@@ -72,11 +75,11 @@ def check_sequence(
     if sequence.odometry is not None:
         findings.append(check_times(sequence.odometry, sequence.timestamps))
     if not steps:
-        return Check(findings, [], [], EyeMatches.empty())
+        return Check(findings, [], [], EyeMatches.empty(), sequence.camera)
     images = check_images([(frame.left, frame.right) for frame, _ in steps])
     frames = [frame for frame, _ in steps]
     findings += [*images, check_light(frames), check_overlay(frames)]
-    matches = EyeMatches.empty()
+    matches, camera = EyeMatches.empty(), sequence.camera
     if has_errors(images):
         # Features of such images would tell nothing, or the same once more.
         findings += unknown_rig("the images allow no matches")
@@ -88,10 +91,12 @@ def check_sequence(
         if overlap.severity == "error":
             findings += unknown_rig(TOO_FEW)
         else:
-            findings += _check_rig(matches, steps, matcher, interval, {each.name for each in wrong(calibration)})
+            rig, camera = _check_rig(matches, steps, matcher, interval, {each.name for each in wrong(calibration)})
+            findings += rig
             if track_imu and sequence.imu is not None:
                 findings += check_motion(sequence, threads)
-    return Check(findings, steps, [rectifier.rectify(frame.left, frame.right) for frame, _ in steps], matches)
+    rectified = [rectifier.rectify(frame.left, frame.right) for frame, _ in steps]
+    return Check(findings, steps, rectified, matches, camera)
 
 
 def _check_rig(
@@ -100,7 +105,7 @@ def _check_rig(
     matcher: EyeMatcher,
     interval: float | None,
     wrong_calibration: set[str],
-) -> list[Finding]:
+) -> tuple[list[Finding], StereoCamera]:
     rectifier = matcher.rectifier
     if wrong_calibration & _INTRINSICS:
         # Lenses that are undistorted wrongly move rows as a delay does.
@@ -110,15 +115,15 @@ def _check_rig(
         when = describe_frames([frame for frame, _ in steps], exchanged)
         message = f"left and right are exchanged in {when}, and not in the others: what wrote them mixes up the cameras"
         rest = matches.select(~np.isin(matches.pair, exchanged))
-        findings = _check_rig(rest, steps, matcher, interval, wrong_calibration)
+        findings, camera = _check_rig(rest, steps, matcher, interval, wrong_calibration)
         swap = Finding("eyes", "error", message, len(exchanged) / len(steps))
-        return [swap, *(each for each in findings if each.name != swap.name)]
+        return [swap, *(each for each in findings if each.name != swap.name)], camera
     pairing = None
     if suspect_pairing(matches, rectifier):
         pairing = check_pairing(matches, _shift_frames(steps, matcher), rectifier, interval)
     if pairing is None:
         return check_rig(matches, rectifier, interval)
-    return [pairing, *unknown_rig("the eyes are not synchronised", but=pairing.name)]
+    return [pairing, *unknown_rig("the eyes are not synchronised", but=pairing.name)], rectifier.camera
 
 
 def _shift_frames(steps: Sequence[FrameStep], matcher: EyeMatcher) -> dict[int, EyeMatches]:

@@ -22,7 +22,7 @@ class Finding:
         severity: "ok"; "unknown", the input does not show it; "warning"; or "error", tracking will fail or be wrong.
         message: one line; names the value, and for warnings and errors the cure.
         figure: the value that was judged, None where there is none.
-        pixels: by how much disparities may be off for it; None where that is not known.
+        pixels: by how much disparities may be off for it, 0 where it is corrected; None where that is not known.
         delay: seconds by which right images are late, if that is what is wrong, and part of a frame.
     """
 
@@ -42,7 +42,8 @@ _UNKNOWN_PIXELS = 2.0
 def disparity_error(findings: Sequence[Finding]) -> float | None:
     """By how many pixels disparities may be off for faults of the eyes that were found; None where none was."""
     faults = [each for each in findings if each.severity in ("warning", "error") and each.name in _OF_THE_EYES]
-    return max((_UNKNOWN_PIXELS if each.pixels is None else each.pixels for each in faults), default=None)
+    pixels = [_UNKNOWN_PIXELS if each.pixels is None else each.pixels for each in faults]
+    return max(filter(None, pixels), default=None)
 
 
 def wrong(findings: Sequence[Finding]) -> list[Finding]:

@@ -19,13 +19,20 @@ def stored_places(matches: EyeMatches, rectifier: StereoRectifier) -> tuple[np.n
     )
 
 
+def rectified_places(
+    matches: EyeMatches, stored: tuple[np.ndarray, np.ndarray], rectifier: StereoRectifier
+) -> EyeMatches:
+    """The matches with left and right places (M, 2) of the stored images as a rectifier sees them."""
+    left, right = stored
+    if not rectifier.camera.is_rectified:
+        left = _rectified(left, rectifier.camera.left, rectifier.R_rectified_left, rectifier.rectified)
+        right = _rectified(right, rectifier.camera.right, rectifier.R_rectified_right, rectifier.rectified)
+    return _finite(replace(matches, left=left, right=right))
+
+
 def exchange_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> EyeMatches:
     """What the matches would be if the left images were given as the right ones and the other way round."""
-    left, right = stored_places(matches, rectifier)
-    if not rectifier.camera.is_rectified:
-        left = _rectified(left, rectifier.camera.right, rectifier.R_rectified_right, rectifier.rectified)
-        right = _rectified(right, rectifier.camera.left, rectifier.R_rectified_left, rectifier.rectified)
-    return _finite(replace(matches, left=right, right=left))
+    return rectified_places(matches, stored_places(matches, rectifier)[::-1], rectifier)
 
 
 def leave_unrectified(matches: EyeMatches, rectifier: StereoRectifier) -> EyeMatches:

@@ -1,21 +1,21 @@
 """What matches between the eyes say about the rig: order of the eyes, rows, rotation, scale and synchronisation."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.finding import Finding, Severity
 from sigmaslam.checks.hypotheses import exchange_eyes, leave_unrectified, stand_upright
+from sigmaslam.checks.levelled_eyes import WARN_ROWS, LevelledEyes, level_eyes
 from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
-from sigmaslam.geometry.camera import RectifiedStereo
+from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.argument_checks import MAX_DELAY
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
-# The tracker searches rows within ROW_TOLERANCE: further off, an error; from half of it on, a warning.
-_WARN_ROWS = 0.5 * ROW_TOLERANCE
 # The tracker takes a pair for swapped where more than this share of the disparities is below -1 px.
 _MAX_BEHIND, _WARN_BEHIND = 0.1, 0.02
 # A rig is explained by a hypothesis that this share of the matches follows, if it is so many times the share of
@@ -30,6 +30,9 @@ _LAG_SHARE = 1 / 3
 # Rows in the stored images agree within this if these are rectified already, pixels.
 _RECTIFIED_ROWS = 0.5
 _SYNCHRONISATION = "synchronisation"
+_CORRECTED = "poses are corrected for it, depth that is measured elsewhere is not"
+# Lenses bend rows as a yaw does, by so much in a tenth of the places: in KITTI's calibrations twice that, pixels.
+_LENS_ROWS = 0.5
 _NAMES = ("eyes", "rig", "distortion", _SYNCHRONISATION, "rows", "rotation", "scale", "infinity")
 TOO_FEW = "too few matches between the eyes to tell"
 
@@ -39,15 +42,17 @@ def unknown_rig(reason: str, names: Sequence[str] = _NAMES, but: str = "") -> li
     return [Finding(name, "unknown", reason) for name in names if name != but]
 
 
-def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: float | None) -> list[Finding]:
-    """Findings from the matches of all pairs together.
+def check_rig(
+    matches: EyeMatches, rectifier: StereoRectifier, frame_interval: float | None
+) -> tuple[list[Finding], StereoCamera]:
+    """Findings from the matches of all pairs together, and the camera without what is wrong with its rows.
 
     Args:
         matches: of pairs of one rig, rectified by `rectifier`.
         frame_interval: seconds from one frame to the next; None: unknown.
     """
     if len(matches) < MIN_MATCHES:
-        return unknown_rig(TOO_FEW)
+        return unknown_rig(TOO_FEW), rectifier.camera
     view = rectifier.rectified
     given = fit_rows(matches, view)
     share = given.agreement(ROW_TOLERANCE)
@@ -60,20 +65,37 @@ def check_rig(matches: EyeMatches, rectifier: StereoRectifier, frame_interval: f
     findings = [_check_eyes(matches, share, swapped, usable)]
     if findings[0].severity == "error":
         # The other checks judge the rig as it is once the eyes are exchanged.
-        matches, given = exchanged, fit_rows(exchanged, view)
-    findings += [_check_position(given, rectifier), _check_distortion(matches, rectifier)]
+        given = fit_rows(exchanged, view)
+        level = LevelledEyes(rectifier, exchanged, given)
+    else:
+        level = level_eyes(matches, rectifier)
+    findings += [_check_position(level.fit, level.rectifier), _check_distortion(level, rectifier)]
     if findings[1].severity == "error":
-        return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:])
-    findings.append(_check_synchronisation(given, frame_interval))
+        return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:]), rectifier.camera
+    findings.append(_check_synchronisation(level.fit, frame_interval))
     if findings[-1].severity not in ("ok", "unknown"):
-        return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:])
-    rotation = _check_rotation(given, view.fx)
-    infinity = (
-        _check_infinity(given)
-        if rotation.severity == "ok"
-        else Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
-    )
-    return [*findings, _check_shift(given), rotation, _check_scale(given, view.fy), infinity]
+        return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:]), rectifier.camera
+    camera, view = level.rectifier.camera, level.rectifier.rectified
+    lens = _LENS_ROWS * abs(given.yaw) / given.most("yaw") if "yaw" in level.causes else 0.0
+    rows = [
+        _corrected(_check_shift(given), level, "shift"),
+        _corrected(_check_rotation(given, view.fx), level, "roll", "yaw", pixels=lens),
+        _corrected(_check_scale(given, view.fx), level, "zoom"),
+    ]
+    infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
+    if _check_rotation(level.fit, view.fx).severity == "ok":
+        infinity = _check_infinity(level.fit)
+    if infinity.severity == "error" and infinity.pixels is not None and findings[0].severity == "ok":
+        right = camera.right
+        camera = replace(camera, right=replace(right, cx=right.cx + infinity.pixels / view.fx * right.fx))
+    return [*findings, *rows, infinity], camera
+
+
+def _corrected(finding: Finding, level: LevelledEyes, *causes: str, pixels: float = 0.0) -> Finding:
+    """A finding about rows, of which disparities may still be off by `pixels` where one of its causes is corrected."""
+    if not set(causes) & set(level.causes):
+        return finding
+    return replace(finding, severity="warning", message=f"{finding.message}; {_CORRECTED}", pixels=pixels)
 
 
 def find_exchanged(matches: EyeMatches, rectifier: StereoRectifier) -> np.ndarray:
@@ -126,17 +148,17 @@ def _check_position(given: RowFit, rectifier: StereoRectifier) -> Finding:
     return Finding("rig", "error", message, share)
 
 
-def _check_distortion(matches: EyeMatches, rectifier: StereoRectifier) -> Finding:
-    """Whether images that the calibration undistorts are rectified already.
+def _check_distortion(level: LevelledEyes, rectifier: StereoRectifier) -> Finding:
+    """Whether images that the calibration, which `rectifier` is of, undistorts are rectified already.
 
     A rectification that is right leaves smaller row differences than there were, whatever else is wrong.
     """
     if rectifier.camera.is_rectified:
         return Finding("distortion", "ok", "the calibration is of rectified images")
-    stored = leave_unrectified(matches, rectifier)
+    stored = leave_unrectified(level.matches, level.rectifier)
     if len(stored) < MIN_MATCHES:
         return Finding("distortion", "unknown", TOO_FEW)
-    before, after = (_mad(fit_rows(each, rectifier.rectified).residual) for each in (stored, matches))
+    before, after = (_mad(fit_rows(each, rectifier.rectified).residual) for each in (stored, level.matches))
     rows = float(np.median(np.abs(stored.row_difference)))
     # A median of absolute values is known to about one part in the root of their number.
     if rows < _RECTIFIED_ROWS and after > before * (1.0 + SIGNIFICANT / np.sqrt(len(stored))):
@@ -219,11 +241,11 @@ def _when(lag: float) -> str:
 
 
 def _check_shift(fit: RowFit) -> Finding:
-    if abs(fit.shift) <= _WARN_ROWS:
+    if abs(fit.shift) <= WARN_ROWS:
         return Finding("rows", "ok", f"right rows are {fit.shift:+.2f} px from the left ones", fit.shift)
     message = (
-        f"right rows are {fit.shift:+.2f} px from the left ones; {ROW_TOLERANCE:g} px can be tracked: crop both images "
-        "alike, correct cy of one eye, or calibrate again"
+        f"right rows are {fit.shift:+.2f} px from the left ones: crop both images alike, correct cy of one eye, or "
+        "calibrate again"
     )
     return Finding("rows", "error" if abs(fit.shift) > ROW_TOLERANCE else "warning", message, fit.shift)
 
@@ -232,7 +254,7 @@ def _check_rotation(fit: RowFit, focal: float) -> Finding:
     roll, yaw = (float(np.degrees(np.arctan(abs(each) / focal))) for each in (fit.roll, fit.yaw))
     return _judge_place(
         "rotation",
-        fit.by_rotation,
+        fit.most("roll", "yaw"),
         f"the right camera is turned against the calibration by {roll:.2f} degrees about its axis and {yaw:.2f} about "
         "the vertical",
         "calibrate again, or correct the rotation of the right camera",
@@ -244,18 +266,16 @@ def _check_scale(fit: RowFit, focal: float) -> Finding:
     percent = 100.0 * fit.zoom / focal
     return _judge_place(
         "scale",
-        fit.by_zoom,
+        fit.most("zoom"),
         f"the right image is {percent:+.2f} % taller than the calibration says",
         "correct fy of one eye, use the same zoom and size in both, or calibrate again",
         f"the right image is {percent:+.2f} % taller",
     )
 
 
-def _judge_place(name: str, rows: np.ndarray, what: str, cure: str, good: str) -> Finding:
-    """Of row differences (M,) that depend on the place."""
-    rows = np.abs(rows)
-    most = float(np.percentile(rows, 90))
-    if most <= _WARN_ROWS:
+def _judge_place(name: str, most: float, what: str, cure: str, good: str) -> Finding:
+    """Of row differences that depend on the place, by that in a tenth of the places, pixels."""
+    if most <= WARN_ROWS:
         return Finding(name, "ok", f"{good}: rows move by {most:.2f} px in a tenth of the places", most)
     severity: Severity = "error" if most > ROW_TOLERANCE else "warning"
     return Finding(name, severity, f"{what}: rows move by {most:.1f} px in a tenth of the places: {cure}", most, most)
@@ -269,8 +289,10 @@ def _check_infinity(fit: RowFit) -> Finding:
     message = (
         f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one "
         "eye or the yaw of the right camera is wrong: calibrate again"
+        + f"; {_CORRECTED}, until the least is 0"
+        * (behind > _MAX_BEHIND)
     )
-    return Finding("infinity", "error" if behind > _MAX_BEHIND else "warning", message, behind)
+    return Finding("infinity", "error" if behind > _MAX_BEHIND else "warning", message, behind, -lowest)
 
 
 def _agreement(matches: EyeMatches, view: RectifiedStereo) -> float:

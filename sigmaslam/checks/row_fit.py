@@ -32,7 +32,7 @@ class RowFit:
             image: row differences with x, y, x y.
         lag: frames by which the right images are later than the left ones; NaN where the motion does not show it.
         sigmas: (5,) standard deviations of all these, in this order.
-        by_rotation, by_zoom: (M,) what roll and yaw, and what zoom make of the rows, pixels.
+        by_cause: (M,) what each of shift, roll, yaw and zoom makes of the rows, pixels, by these names.
         by_lag: (M, 2) what the lag makes of the right places, pixels.
         residual: (M,) row differences that are left, pixels.
     """
@@ -44,8 +44,7 @@ class RowFit:
     yaw: float
     lag: float
     sigmas: np.ndarray
-    by_rotation: np.ndarray
-    by_zoom: np.ndarray
+    by_cause: dict[str, np.ndarray]
     by_lag: np.ndarray
     residual: np.ndarray
 
@@ -61,6 +60,10 @@ class RowFit:
         if not abs(self.lag) > SIGNIFICANT * self.sigmas[4]:
             return 0.0
         return float(np.median(np.linalg.norm(self.by_lag, axis=1)))
+
+    def most(self, *causes: str) -> float:
+        """Pixels by which causes together move rows in a tenth of the places at least."""
+        return float(np.percentile(np.abs(sum(self.by_cause[name] for name in causes)), 90))
 
     def agreement(self, tolerance: float) -> float:
         """Share that a parallel pair with these errors has: rows within `tolerance` px, disparity above -0.5 of it."""
@@ -86,8 +89,8 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
             coefficients[4], sigmas[4] = own[0][4], own[1][4]
             coefficients[:4], sigmas[:4] = _fit(columns[:, :4], rows - coefficients[4] * flow[:, 1], chances)
     shift, roll, zoom, yaw, lag = coefficients.tolist()
-    by_rotation, residual = columns[:, [1, 3]] @ coefficients[[1, 3]], rows - columns @ coefficients
-    places = by_rotation, columns[:, 2] * zoom, lag * flow, residual
+    by_cause = {"shift": np.full(len(x), shift), "roll": roll * x, "yaw": yaw * x * y, "zoom": zoom * y}
+    places = by_cause, lag * flow, rows - columns @ coefficients
     return RowFit(matches, shift, roll, zoom, yaw, lag if moving else np.nan, sigmas, *places)
 
 

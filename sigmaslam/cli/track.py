@@ -216,8 +216,8 @@ def track(
     sequence = request.input.open()
     if not (overwrite or resume):
         check_new_folder(out, "--out, give --overwrite or --resume")
+    opened = InputOptions(sequence, findings=_check(sequence, strict, threads))
     with open_sinks(request.live, out, sequence.camera) as sinks:
-        opened = InputOptions(sequence, findings=_check(sequence, strict, threads))
         tell_summary(_track(replace(request, input=opened, live=LiveOptions(sinks=sinks))), out)
 
 
@@ -267,14 +267,18 @@ def _track(request: TrackRequest) -> dict[str, Any]:
 
 
 def _check(sequence: StereoSequence, strict: bool, threads: int) -> list[Finding]:
-    """Findings about the first frames; those that are not good are warned of, and refused with `strict`."""
+    """Findings about the first frames; those that are not good are warned of, and refused with `strict`.
+
+    What is wrong with rows is corrected.
+    """
     import cv2
 
     cv2.setNumThreads(threads)
-    findings = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, threads).findings
-    faults = wrong(findings)
+    check = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, threads)
+    faults = wrong(check.findings)
     if strict and faults:
         raise InputError(f"{sequence.source}: " + "; ".join(each.message for each in faults))
     for each in faults:
         logger.warning("%s: %s", each.name, each.message)
-    return findings
+    sequence.camera = check.camera
+    return check.findings

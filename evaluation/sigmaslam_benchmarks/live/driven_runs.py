@@ -104,7 +104,8 @@ def track_ours(
         sequence = DrivenSequence(frames, camera)
         sequence.imu = imu
         with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
-            findings = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, 1).findings
+            check = check_sequence(sequence, SAMPLES_BEFORE_TRACKING, 1)
+            findings, sequence.camera = check.findings, check.camera
             source, live = InputOptions(sequence, findings=findings), LiveOptions(on_estimate=keep)
             summary = track_sequence(TrackRequest(source, OutputOptions(out), TrackerOptions(threads=1), live))
         told.write("".join(f"{each.message}\n" for each in wrong(findings)))

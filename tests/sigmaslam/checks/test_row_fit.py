@@ -73,7 +73,7 @@ def test_a_camera_at_rest_shows_no_lag():
 
 
 def findings_of(matches: EyeMatches) -> dict[str, tuple[str, float | None]]:
-    found = check_rig(matches, StereoRectifier(camera()), 0.1)
+    found = check_rig(matches, StereoRectifier(camera()), 0.1)[0]
     return {each.name: (each.severity, each.figure) for each in found}
 
 
@@ -82,9 +82,9 @@ def test_a_good_rig_is_good():
 
 
 @pytest.mark.parametrize(
-    ("shift", "severity"), [(0.5, "ok"), (-0.5, "ok"), (1.5, "warning"), (-1.5, "warning"), (3.0, "error")]
+    ("shift", "severity"), [(0.5, "ok"), (-0.5, "ok"), (1.5, "warning"), (-1.5, "warning"), (3.0, "warning")]
 )
-def test_rows_are_judged_by_what_the_tracker_can_follow(shift: float, severity: str):
+def test_rows_are_judged_by_what_calibrations_are_off_by(shift: float, severity: str):
     found = findings_of(matches_of((shift, 0.0, 0.0, 0.0)))
     assert found["rows"][0] == severity
     assert found["rows"][1] == pytest.approx(shift, abs=0.1)
@@ -114,12 +114,12 @@ def test_a_part_of_a_frame_between_the_eyes_is_measured():
 
 
 def test_a_delay_of_a_few_milliseconds_is_told_in_seconds():
-    found = {each.name: each for each in check_rig(matches_of(lag=0.1), StereoRectifier(camera()), 0.1)}
+    found = {each.name: each for each in check_rig(matches_of(lag=0.1), StereoRectifier(camera()), 0.1)[0]}
     assert found["synchronisation"].severity == "warning"
     assert found["synchronisation"].delay == pytest.approx(0.01, abs=0.001)
     assert found["eyes"].delay == 0.0
     # Stamps in milliseconds: no velocity lasts so long, and no tracker takes that.
-    found = {each.name: each for each in check_rig(matches_of(lag=0.1), StereoRectifier(camera()), 100.0)}
+    found = {each.name: each for each in check_rig(matches_of(lag=0.1), StereoRectifier(camera()), 100.0)[0]}
     assert (found["synchronisation"].severity, found["synchronisation"].delay) == ("warning", 0.0)
 
 

@@ -1,0 +1,87 @@
+"""The right camera as the matches have it: turned, moved or enlarged until both eyes see a place in the same row."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sigmaslam.checks.eye_matches import EyeMatches
+from sigmaslam.checks.hypotheses import rectified_places, stored_places
+from sigmaslam.checks.row_fit import RowFit, fit_rows
+from sigmaslam.errors import CalibrationError
+from sigmaslam.frontend.row_search import ROW_TOLERANCE
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
+from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import rigid_motion
+
+WARN_ROWS = 0.5 * ROW_TOLERANCE
+"""The tracker searches rows within ROW_TOLERANCE: further off, an error; from half of it on, a warning."""
+# What is wrong by more than so many of the usual standard deviations is no error that calibrations usually have.
+_CREDIBLE = 4.0
+# The fit is of first order: of a turn by five degrees a hundredth of a pixel is left after so many.
+_ROUNDS = 4
+# So many of the matches must lie in one row then.
+_LEVEL = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class LevelledEyes:
+    """A rig whose rows agree.
+
+    Attributes:
+        rectifier: of the corrected pair.
+        matches: in its images.
+        fit: of what is left.
+        causes: of `RowFit.by_cause`, what was corrected; empty where nothing was.
+    """
+
+    rectifier: StereoRectifier
+    matches: EyeMatches
+    fit: RowFit
+    causes: tuple[str, ...] = ()
+
+
+def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
+    """Corrects the right camera by what moves rows; the rig as it is where all agree, or nothing makes most agree.
+
+    Rows that are all lower are those of a pitch or of another principal point, whichever leaves less. Lenses bend rows
+    as a yaw does, by up to what is warned of.
+
+    Args:
+        matches: in the images of `rectifier`.
+    """
+    given = LevelledEyes(rectifier, matches, fit_rows(matches, rectifier.rectified))
+    usual, focal = CalibrationSigmas(), rectifier.rectified.fx
+    limits = {"shift": usual.rotation, "roll": usual.rotation, "zoom": usual.distortion}
+    causes = tuple(name for name in limits if abs(getattr(given.fit, name)) > _CREDIBLE * limits[name] * focal)
+    if given.fit.most("yaw") > WARN_ROWS:
+        causes = (*causes, "yaw")
+    stored, found, least = stored_places(matches, rectifier), [given], np.median(np.abs(matches.row_difference))
+    for is_turned in (True, False) if "shift" in causes else (True,) if causes else ():
+        eyes = replace(given, causes=causes)
+        try:
+            for _ in range(_ROUNDS):
+                other = StereoRectifier(_corrected(eyes, is_turned))
+                moved = rectified_places(matches, stored, other)
+                eyes = LevelledEyes(other, moved, fit_rows(moved, other.rectified), causes)
+        except CalibrationError:  # no rig that could be
+            continue
+        rows = np.abs(moved.row_difference)
+        if len(rows) and float((rows <= WARN_ROWS).mean()) > _LEVEL and np.median(rows) < least:
+            found.append(eyes)
+    return min(found[1:] or found, key=lambda eyes: float(np.median(np.abs(eyes.fit.residual))))
+
+
+def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:
+    """The camera without what the fit has left of the causes; a shift is that of a turn, or of the principal point."""
+    camera, focal = eyes.rectifier.camera, eyes.rectifier.rectified.fx
+    shift, roll, yaw, zoom = (
+        getattr(eyes.fit, name) / focal * (name in eyes.causes) for name in ("shift", "roll", "yaw", "zoom")
+    )
+    right, to_right = camera.right, eyes.rectifier.R_rectified_right
+    right = replace(right, fx=(1.0 + zoom) * right.fx, fy=(1.0 + zoom) * right.fy)
+    right = right if is_turned else replace(right, cy=right.cy + shift * right.fy)
+    turn, _ = cv2.Rodrigues(np.array([shift * is_turned, -yaw, -roll]))
+    R = camera.T_left_right[:3, :3] @ to_right.T @ turn @ to_right
+    return replace(camera, right=right, T_left_right=rigid_motion(R, camera.T_left_right[:3, 3]))

@@ -1,0 +1,133 @@
+"""A right camera that is turned, moved or enlarged is found again from where matches are in the images."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from sigmaslam.checks import check_sequence
+from sigmaslam.checks.eye_matches import EyeMatches
+from sigmaslam.checks.levelled_eyes import level_eyes
+from sigmaslam.checks.rig import check_rig
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
+from sigmaslam.geometry.rectification import StereoRectifier
+from sigmaslam.geometry.se3 import rigid_motion
+from sigmaslam.slam.tracker import StereoTracker
+from tests.support.estimates import Demo
+from tests.support.injected_faults import FAULTS, sequence_of
+
+LENS = (-0.28, 0.07, 0.0002, 0.00002)
+NOISE = 0.1
+
+
+def rig(distortion: tuple[float, ...] = (), turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> StereoCamera:
+    """Cameras of 640 x 480 pixels, 0.1 m apart; the right one is turned by degrees about its axes."""
+    kind = "radtan" if distortion else "none"
+    model = CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5, distortion_model=kind, distortion=distortion)
+    return StereoCamera(model, model, rigid_motion(cv2.Rodrigues(np.radians(turn))[0], [0.1, 0.0, 0.0]))
+
+
+def matches_of(true: StereoCamera, given: StereoCamera, outliers: float = 0.1) -> EyeMatches:
+    """Of points 1 to 20 m away, seen by one rig and rectified by the calibration of another."""
+    rng, rectifier = np.random.default_rng(0), StereoRectifier(given)
+    points = rng.uniform((-0.5, -0.4, 1.0), (0.5, 0.4, 1.0), (600, 3)) / rng.uniform(0.05, 1.0, (600, 1))
+    of_right = (points - true.T_left_right[:3, 3]) @ true.T_left_right[:3, :3]
+    seen = [true.left.project(points), true.right.project(of_right)]
+    seen[1] += rng.normal(scale=NOISE, size=seen[1].shape)
+    seen[1][rng.random(600) < outliers] += rng.uniform(-80.0, 80.0, 2)
+    turns = rectifier.R_rectified_left, rectifier.R_rectified_right
+    models = given.left, given.right
+    places = [
+        rectifier.rectified.project(model.unproject(pixels) @ R.T)[:, :2]
+        for model, pixels, R in zip(models, seen, turns, strict=True)
+    ]
+    inside = np.isfinite(np.hstack(places)).all(axis=1)
+    left, right = (each[inside] for each in places)
+    covariance, flow = np.tile(NOISE**2 * np.eye(2), (len(left), 1, 1)), np.full_like(left, np.nan)
+    return EyeMatches(left, right, covariance, np.full(len(left), 0.9), flow, np.zeros(len(left), int))
+
+
+def turned_by(camera: StereoCamera, other: StereoCamera) -> np.ndarray:
+    """(3,) degrees from one right camera to another's."""
+    return np.degrees(cv2.Rodrigues(camera.T_left_right[:3, :3].T @ other.T_left_right[:3, :3])[0].ravel())
+
+
+@pytest.mark.parametrize("distortion", [(), LENS])
+@pytest.mark.parametrize(
+    "turn", [(0.5, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, -2.0), (1.0, 4.0, 1.0)]
+)
+def test_a_turned_right_camera_is_turned_back(turn: tuple[float, float, float], distortion: tuple[float, ...]):
+    true, given = rig(distortion, turn), rig(distortion)
+    level = level_eyes(matches_of(true, given), StereoRectifier(given))
+    # A tenth of a pixel over six hundred matches; a yaw shows in the corners alone.
+    np.testing.assert_array_less(np.abs(turned_by(true, level.rectifier.camera)), (0.003, 0.05, 0.01))
+    assert np.median(np.abs(level.matches.row_difference)) < 2.0 * NOISE
+
+
+@pytest.mark.parametrize("rows", [-20.0, 3.0])
+def test_a_moved_principal_point_is_no_turn(rows: float):
+    given, true = rig(LENS), rig(LENS)
+    true = replace(true, right=replace(true.right, cy=true.right.cy + rows))
+    camera = level_eyes(matches_of(true, given), StereoRectifier(given)).rectifier.camera
+    assert camera.right.cy == pytest.approx(true.right.cy, abs=0.05)
+    np.testing.assert_allclose(turned_by(true, camera), 0.0, atol=0.01)
+
+
+def test_an_enlarged_right_image_is_no_turn():
+    given, true = rig(LENS), rig(LENS)
+    true = replace(true, right=replace(true.right, fx=1.03 * 500.0, fy=1.03 * 500.0))
+    level = level_eyes(matches_of(true, given), StereoRectifier(given))
+    assert level.causes == ("zoom",)
+    assert level.rectifier.camera.right.fy == pytest.approx(515.0, abs=0.3)
+
+
+def test_rows_that_agree_are_left_as_they_are():
+    given = rig(LENS)
+    rectifier = StereoRectifier(given)
+    # Less than calibrations are usually off by.
+    level = level_eyes(matches_of(rig(LENS, (0.05, 0.0, 0.05)), given), rectifier)
+    assert level.causes == ()
+    assert level.rectifier is rectifier
+
+
+def test_no_rig_is_made_of_matches_that_follow_none():
+    given = rig()
+    matches = matches_of(given, given)
+    matches.right[:] = np.random.default_rng(1).uniform((0, 0), (640, 480), matches.right.shape)
+    assert level_eyes(matches, StereoRectifier(given)).causes == ()
+
+
+def test_what_is_corrected_is_said_and_hinders_nothing():
+    given = rig(LENS)
+    findings, camera = check_rig(matches_of(rig(LENS, (1.0, 0.0, 1.0)), given), StereoRectifier(given), 0.1)
+    named = {each.name: each for each in findings}
+    for name in ("rows", "rotation"):
+        assert named[name].severity == "warning"
+        assert "poses are corrected" in named[name].message
+        assert not named[name].pixels
+    assert {each.severity for each in findings if each.name not in ("rows", "rotation")} == {"ok", "unknown"}
+    np.testing.assert_allclose(turned_by(given, camera), (1.0, 0.0, 1.0), atol=0.05)
+
+
+def test_a_yaw_that_lenses_could_be_leaves_poses_doubtful():
+    given = rig(LENS)
+    findings, _ = check_rig(matches_of(rig(LENS, (0.0, 4.0, 0.0)), given), StereoRectifier(given), 0.1)
+    rotation = next(each for each in findings if each.name == "rotation")
+    # Half a pixel of rows in the corners.
+    assert rotation.pixels == pytest.approx(4.0, abs=3.0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", ["rows off by 3", "turned by roll 1", "turned by pitch 2"])
+def test_the_demo_is_tracked_as_well_with_a_right_eye_that_is_off(fault: str, demo: Demo):
+    camera, frames, truth = demo
+    frames = frames[:12]
+    sequence = FAULTS[fault].inject(frames, camera)
+    errors = []
+    for seen, calibration in ((sequence_of(frames, camera), camera), (sequence, check_sequence(sequence, 4).camera)):
+        tracker = StereoTracker(calibration)
+        poses = [tracker.step(each.left, each.right, each.timestamp).T_world_camera for each in seen.frames()]
+        motion = np.linalg.inv(truth[0]) @ truth[len(frames) - 1]
+        errors.append(np.linalg.norm(poses[-1][:3, 3] - motion[:3, 3]))
+    assert errors[1] < 3.0 * errors[0] + 0.001
