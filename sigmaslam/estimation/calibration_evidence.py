@@ -48,7 +48,7 @@ HYPOTHESES = {
 """What each moves of the tracker's errors, all alike.
 
 Baseline and focal length of both eyes cannot be told from the scene, a roll and a bend not from patches of a road that
-are misplaced alike (docs/notebook/README.md). A pitch that disparities show moves rows beyond what is tracked.
+are misplaced alike (docs/notebook/README.md). Rows show a pitch, and are corrected before tracking.
 """
 
 
@@ -83,7 +83,8 @@ class CalibrationEvidence:
         self._sigma = np.maximum(usual.sigma, _LEAST_SIGMA * units)
         self._is_uncertain = usual.sigma > 0.0
         # Standard deviation times direction of a hypothesis, in the usual sigmas: s w.
-        size = _SIZE * focal_length / self._sigma
+        self._gross = _SIZE * focal_length
+        size = self._gross / self._sigma
         self._spreads = {name: size * np.isin(ERRORS, moved) for name, moved in HYPOTHESES.items()}
         self._condition = condition
         self.expected = np.zeros(len(ERRORS)) if expected is None else expected.copy()
@@ -147,6 +148,10 @@ class CalibrationEvidence:
         weights = {name: _PRIOR * np.exp(ratio - top) for name, (ratio, _, _) in found.items()}
         total = (1.0 - _PRIOR * len(found)) * np.exp(-top) + sum(weights.values())
         return {k: Cause(odds / total, *found[k][1:]) for k, odds in weights.items() if odds > _HOPELESS * total}
+
+    def is_gross(self, causes: dict[str, Cause]) -> bool:
+        """Whether one is likely that no calibration usually has: what it does is no longer linear."""
+        return any(cause.probability > 0.5 and abs(cause.mean) > self._gross for cause in causes.values())
 
     def beside(self, causes: dict[str, Cause]) -> tuple[np.ndarray, float]:
         """What images show of all errors together beside these causes; views count by a part.

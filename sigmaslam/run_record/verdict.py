@@ -62,7 +62,7 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
         summary: of run.json: by reason in how many frames, and when first, in seconds.
     """
     words = {
-        Doubt.INPUT: "a check of the input found that the eyes do not fit",
+        Doubt.INPUT: "a check of the input, or what images show in motion, found that the eyes do not fit",
         Doubt.OFFSET: "disparities are off by more than calibrations are. Poses are corrected, and have the scale of a "
         "calibration that is right within arm's reach, where boards are held: calibrate again",
         Doubt.TIME: "the image shows another moment than its stamp says, as if the driver exchanged frames",

@@ -84,7 +84,7 @@ class Scrutiny:
             matches, fit = self._leave_out(matches, second, moving)
             doubts.add_motion(drawn, fit.pose)
             second = find_second_motion(self._window, matches, fit, moving)
-        if self._input_is_wrong:
+        if self._input_is_wrong or self._window.evidence.is_gross(self._window.causes):
             doubts.add(Doubt.INPUT)
         for index in np.flatnonzero(self._window.exceeded).tolist():
             doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))

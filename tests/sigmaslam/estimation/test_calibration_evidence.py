@@ -72,6 +72,20 @@ def test_expected_errors_are_those_of_all_measurements_together(cause: str | Non
     np.testing.assert_allclose(found, np.where(np.isin(ERRORS, SHOWN), gain @ measured, 0.0), rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("name", "cause", "is_gross"),
+    [
+        ("yaw", Cause(0.99, -0.012 * CAMERA.fx, 0.1), True),
+        ("yaw", Cause(0.4, -0.012 * CAMERA.fx, 0.1), False),
+        ("zoom", Cause(0.99, 0.009 * CAMERA.fx, 0.1), False),
+    ],
+)
+def test_a_likely_cause_is_gross_beyond_half_a_degree(name: str, cause: Cause, is_gross: bool):
+    evidence = CalibrationEvidence(USUAL, CAMERA.fx, load_step("window_condition"))
+    assert evidence.is_gross({name: cause}) == is_gross
+    assert not evidence.is_gross({})
+
+
 def test_nothing_is_wrong_until_evidence_speaks():
     assert weigh(np.zeros((COUNT, len(ERRORS))), np.zeros(COUNT)) == {}
     silent = [weigh(*measurements(seed, "yaw", 0.0)) for seed in range(40)]
