@@ -1,5 +1,6 @@
 """The page of the benchmark `live`."""
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from sigmaslam_benchmarks.tracking.page import fill_page, number
 
 # In the order of the page; a starting frame has no pose yet.
 _STATUSES = ("tracking", "doubtful", "ambiguous", "relocalised", "lost", "skipped", "refused")
+# Sentences of a case that the page shows: those that most of its runs have.
+_SENTENCES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +65,7 @@ def format_page(page: LivePage) -> str:
         open=page.asked - len(page.found),
         methods=[(method, *_totals(page, method)) for method in page.methods],
         tables=[(method, list(_case_rows(page, method))) for method in page.methods],
+        words=list(_words(page)),
         left_out=sorted({each for each in page.found.values() if isinstance(each, str)}),
     )
 
@@ -91,6 +95,31 @@ def _case_rows(page: LivePage, method: str) -> Iterator[list[str]]:
             f"{sum(count > 0 for count in silent.values())} of {len(silent)}",
             *sizes,
         ]
+
+
+def _words(page: LivePage) -> Iterator[tuple[str, str]]:
+    """What the first method says of each case and not of most good frames, and of how many recordings."""
+    usual = _sentences(page.judgements(page.methods[0], NO_FAULT).values())
+    for case in page.cases:
+        results = page.judgements(page.methods[0], case).values()
+        said = [
+            f"{words} ({count} of {len(results)})"
+            for key, (words, count) in sorted(_sentences(results).items(), key=lambda item: -item[1][1])
+            if 2 * usual.get(key, ("", 0))[1] < len(results)
+        ]
+        if results:
+            yield case, " / ".join(said[:_SENTENCES]).replace("|", "\\|").replace("\n", " ") or "nothing"
+
+
+def _sentences(results: Iterable[Judgement]) -> dict[str, tuple[str, int]]:
+    """By sentence without its numbers: the first one, and how many results have it."""
+    found: dict[str, tuple[str, int]] = {}
+    for result in results:
+        said = [*result.said, *([f"refused: {result.refused}"] if result.refused else [])]
+        for key, words in {re.sub(r"[-+]?\d+(\.\d+)?", "#", each): each for each in said}.items():
+            first, count = found.get(key, (words, 0))
+            found[key] = first, count + 1
+    return found
 
 
 def _statuses(results: Iterable[Judgement]) -> str:
