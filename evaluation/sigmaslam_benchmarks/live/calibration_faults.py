@@ -21,10 +21,15 @@ def move_centre(columns: float, camera: StereoCamera) -> StereoCamera:
     return replace(camera, right=replace(camera.right, cx=camera.right.cx + columns))
 
 
-def turn_right(degrees: tuple[float, float], camera: StereoCamera) -> StereoCamera:
-    """The right camera is given turned about its x and y axes."""
+def lower_centre(rows: float, camera: StereoCamera) -> StereoCamera:
+    """The right principal point is given too low, pixels."""
+    return replace(camera, right=replace(camera.right, cy=camera.right.cy + rows))
+
+
+def turn_right(degrees: tuple[float, float, float], camera: StereoCamera) -> StereoCamera:
+    """The right camera is given turned about its x, y and z axes."""
     T_left_right = camera.T_left_right.copy()
-    T_left_right[:3, :3] = T_left_right[:3, :3] @ cv2.Rodrigues(np.radians([*degrees, 0.0]))[0]
+    T_left_right[:3, :3] = T_left_right[:3, :3] @ cv2.Rodrigues(np.radians(degrees))[0]
     return replace(camera, T_left_right=T_left_right)
 
 
@@ -49,7 +54,7 @@ def bend_right(k1: float, camera: StereoCamera) -> StereoCamera:
 
 
 def _sizes(name: str, words: str, change: Any, sizes: dict[str, Any]) -> dict[str, Fault]:
-    """A fault of three sizes."""
+    """A fault of some sizes."""
     return {
         f"{name}_{size}": Fault(words.format(size), FAULTS[NO_FAULT].spoil, miscalibrate=partial(change, value))
         for size, value in sizes.items()
@@ -58,21 +63,33 @@ def _sizes(name: str, words: str, change: Any, sizes: dict[str, Any]) -> dict[st
 
 CALIBRATION_FAULTS: dict[str, Fault] = {
     NO_FAULT: FAULTS[NO_FAULT],
-    **_sizes("centre", "cx of the right eye {} px too large", move_centre, {"1": 1.0, "2": 2.0, "4": 4.0}),
+    **_sizes(
+        "centre", "cx of the right eye {} px too large", move_centre, {"1": 1.0, "2": 2.0, "4": 4.0, "-10": -10.0}
+    ),
+    **_sizes("rows", "cy of the right eye {} px too large", lower_centre, {"1": 1.0, "4": 4.0, "15": 15.0}),
     **_sizes(
         "yaw",
         "right eye turned by {}° about the vertical",
         turn_right,
-        {"0.05": (0.0, 0.05), "0.1": (0.0, 0.1), "0.3": (0.0, 0.3)},
+        {f"{size:g}": (0.0, size, 0.0) for size in (0.05, 0.1, 0.3, 1.0)},
     ),
     **_sizes(
         "pitch",
         "right eye turned by {}° up or down",
         turn_right,
-        {"0.03": (0.03, 0.0), "0.06": (0.06, 0.0), "0.12": (0.12, 0.0)},
+        {f"{size:g}": (size, 0.0, 0.0) for size in (0.03, 0.06, 0.12, 0.5)},
     ),
     **_sizes(
-        "zoom", "focal length of the right eye {} % too long", zoom_right, {"0.2": 0.002, "0.5": 0.005, "1": 0.01}
+        "roll",
+        "right eye turned by {}° about its axis",
+        turn_right,
+        {f"{size:g}": (0.0, 0.0, size) for size in (0.1, 0.5, 2.0)},
+    ),
+    **_sizes(
+        "zoom",
+        "focal length of the right eye {} % too long",
+        zoom_right,
+        {"0.2": 0.002, "0.5": 0.005, "1": 0.01, "2": 0.02},
     ),
     **_sizes("baseline", "baseline {} % too long", stretch_baseline, {"0.5": 0.005, "1": 0.01, "2": 0.02}),
     **_sizes("k1", "k1 of the right lens {} too large", bend_right, {"0.005": 0.005, "0.01": 0.01, "0.02": 0.02}),
