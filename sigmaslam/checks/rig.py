@@ -76,26 +76,14 @@ def check_rig(
     if findings[-1].severity not in ("ok", "unknown"):
         return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:]), rectifier.camera
     camera, view = level.rectifier.camera, level.rectifier.rectified
-    lens = _LENS_ROWS * abs(given.yaw) / given.most("yaw") if "yaw" in level.causes else 0.0
-    rows = [
-        _corrected(_check_shift(given), level, "shift"),
-        _corrected(_check_rotation(given, view.fx), level, "roll", "yaw", pixels=lens),
-        _corrected(_check_scale(given, view.fx), level, "zoom"),
-    ]
+    rows = _check_rows(given, level, view.fx)
     infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
-    if _check_rotation(level.fit, view.fx).severity == "ok":
+    if level.fit.most("roll", "yaw") <= WARN_ROWS:
         infinity = _check_infinity(level.fit)
     if infinity.severity == "error" and infinity.pixels is not None and findings[0].severity == "ok":
         right = camera.right
         camera = replace(camera, right=replace(right, cx=right.cx + infinity.pixels / view.fx * right.fx))
     return [*findings, *rows, infinity], camera
-
-
-def _corrected(finding: Finding, level: LevelledEyes, *causes: str, pixels: float = 0.0) -> Finding:
-    """A finding about rows, of which disparities may still be off by `pixels` where one of its causes is corrected."""
-    if not set(causes) & set(level.causes):
-        return finding
-    return replace(finding, severity="warning", message=f"{finding.message}; {_CORRECTED}", pixels=pixels)
 
 
 def find_exchanged(matches: EyeMatches, rectifier: StereoRectifier) -> np.ndarray:
@@ -240,45 +228,28 @@ def _when(lag: float) -> str:
     return "later" if lag > 0 else "earlier"
 
 
-def _check_shift(fit: RowFit) -> Finding:
-    if abs(fit.shift) <= WARN_ROWS:
-        return Finding("rows", "ok", f"right rows are {fit.shift:+.2f} px from the left ones", fit.shift)
-    message = (
-        f"right rows are {fit.shift:+.2f} px from the left ones: crop both images alike, correct cy of one eye, or "
-        "calibrate again"
+def _check_rows(given: RowFit, level: LevelledEyes, focal: float) -> list[Finding]:
+    """What moves rows: all alike, as a turn does, or as another size of the image; and whether that is corrected."""
+    roll, yaw = (float(np.degrees(np.arctan(abs(each) / focal))) for each in (given.roll, given.yaw))
+    shift = f"right rows are {given.shift:+.2f} px from the left ones"
+    turn = f"the right camera is turned by {roll:.2f} degrees about its axis, {yaw:.2f} about the vertical"
+    size = f"the right image is {100.0 * given.zoom / focal:+.2f} % taller"
+    kinds = (
+        ("rows", ("shift",), shift, "crop both images alike, correct cy of one eye"),
+        ("rotation", ("roll", "yaw"), turn, "correct the rotation of the right camera"),
+        ("scale", ("zoom",), size, "correct fy of one eye, use the same zoom and size in both"),
     )
-    return Finding("rows", "error" if abs(fit.shift) > ROW_TOLERANCE else "warning", message, fit.shift)
-
-
-def _check_rotation(fit: RowFit, focal: float) -> Finding:
-    roll, yaw = (float(np.degrees(np.arctan(abs(each) / focal))) for each in (fit.roll, fit.yaw))
-    return _judge_place(
-        "rotation",
-        fit.most("roll", "yaw"),
-        f"the right camera is turned against the calibration by {roll:.2f} degrees about its axis and {yaw:.2f} about "
-        "the vertical",
-        "calibrate again, or correct the rotation of the right camera",
-        f"the right camera is turned by {roll:.2f} degrees about its axis, {yaw:.2f} about the vertical",
-    )
-
-
-def _check_scale(fit: RowFit, focal: float) -> Finding:
-    percent = 100.0 * fit.zoom / focal
-    return _judge_place(
-        "scale",
-        fit.most("zoom"),
-        f"the right image is {percent:+.2f} % taller than the calibration says",
-        "correct fy of one eye, use the same zoom and size in both, or calibrate again",
-        f"the right image is {percent:+.2f} % taller",
-    )
-
-
-def _judge_place(name: str, most: float, what: str, cure: str, good: str) -> Finding:
-    """Of row differences that depend on the place, by that in a tenth of the places, pixels."""
-    if most <= WARN_ROWS:
-        return Finding(name, "ok", f"{good}: rows move by {most:.2f} px in a tenth of the places", most)
-    severity: Severity = "error" if most > ROW_TOLERANCE else "warning"
-    return Finding(name, severity, f"{what}: rows move by {most:.1f} px in a tenth of the places: {cure}", most, most)
+    findings = []
+    for name, causes, what, cure in kinds:
+        most, corrected = given.most(*causes), {*causes} & {*level.causes}
+        pixels = _LENS_ROWS * abs(given.yaw) / given.most("yaw") if "yaw" in corrected else most * (not corrected)
+        what = what if name == "rows" else f"{what}: rows move by {most:.2f} px in a tenth of the places"
+        severity: Severity = "ok"
+        if corrected or most > WARN_ROWS:
+            severity = "error" if most > ROW_TOLERANCE and not corrected else "warning"
+            what = f"{what}: {cure}, or calibrate again" + f"; {_CORRECTED}" * bool(corrected)
+        findings.append(Finding(name, severity, what, given.shift if name == "rows" else most, pixels))
+    return findings
 
 
 def _check_infinity(fit: RowFit) -> Finding:
@@ -289,10 +260,10 @@ def _check_infinity(fit: RowFit) -> Finding:
     message = (
         f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one "
         "eye or the yaw of the right camera is wrong: calibrate again"
-        + f"; {_CORRECTED}, until the least is 0"
-        * (behind > _MAX_BEHIND)
     )
-    return Finding("infinity", "error" if behind > _MAX_BEHIND else "warning", message, behind, -lowest)
+    if behind <= _MAX_BEHIND:
+        return Finding("infinity", "warning", message, behind, -lowest)
+    return Finding("infinity", "error", f"{message}; {_CORRECTED}, until the least is 0", behind, -lowest)
 
 
 def _agreement(matches: EyeMatches, view: RectifiedStereo) -> float:
