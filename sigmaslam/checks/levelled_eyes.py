@@ -1,13 +1,14 @@
 """The right camera as the matches have it: turned, moved or enlarged until both eyes see a place in the same row."""
 
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import cv2
 import numpy as np
 
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.hypotheses import rectified_places, stored_places
-from sigmaslam.checks.row_fit import RowFit, fit_rows
+from sigmaslam.checks.row_fit import SIGNIFICANT, RowFit, fit_rows
 from sigmaslam.errors import CalibrationError
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
@@ -21,6 +22,8 @@ WARN_ROWS = 0.5 * ROW_TOLERANCE
 _CREDIBLE = 4.0
 # The fit is of first order: of a turn by five degrees a hundredth of a pixel is left after so many.
 _ROUNDS = 4
+# In the order of `RowFit.sigmas`.
+_CAUSES = ("shift", "roll", "zoom", "yaw")
 # So many of the matches must lie in one row then.
 _LEVEL = 0.5
 
@@ -52,11 +55,11 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
         matches: in the images of `rectifier`.
     """
     given = LevelledEyes(rectifier, matches, fit_rows(matches, rectifier.rectified))
-    usual, focal = CalibrationSigmas(), rectifier.rectified.fx
-    limits = {"shift": usual.rotation, "roll": usual.rotation, "zoom": usual.distortion}
-    causes = tuple(name for name in limits if abs(getattr(given.fit, name)) > _CREDIBLE * limits[name] * focal)
-    if given.fit.most("yaw") > WARN_ROWS:
-        causes = (*causes, "yaw")
+    usual, focal, sizes = CalibrationSigmas(), rectifier.rectified.fx, np.abs([getattr(given.fit, k) for k in _CAUSES])
+    limits = _CREDIBLE * focal * np.array([usual.rotation, usual.rotation, usual.distortion, 0.0])
+    is_wrong = sizes > np.maximum(limits, SIGNIFICANT * given.fit.sigmas[: len(_CAUSES)])
+    is_wrong[-1] &= given.fit.most("yaw") > WARN_ROWS
+    causes = tuple(compress(_CAUSES, is_wrong))
     stored, found, least = stored_places(matches, rectifier), [given], np.median(np.abs(matches.row_difference))
     for is_turned in (True, False) if "shift" in causes else (True,) if causes else ():
         eyes = replace(given, causes=causes)
@@ -76,9 +79,7 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
 def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:
     """The camera without what the fit has left of the causes; a shift is that of a turn, or of the principal point."""
     camera, focal = eyes.rectifier.camera, eyes.rectifier.rectified.fx
-    shift, roll, yaw, zoom = (
-        getattr(eyes.fit, name) / focal * (name in eyes.causes) for name in ("shift", "roll", "yaw", "zoom")
-    )
+    shift, roll, zoom, yaw = (getattr(eyes.fit, name) / focal * (name in eyes.causes) for name in _CAUSES)
     right, to_right = camera.right, eyes.rectifier.R_rectified_right
     right = replace(right, fx=(1.0 + zoom) * right.fx, fy=(1.0 + zoom) * right.fy)
     right = right if is_turned else replace(right, cy=right.cy + shift * right.fy)

@@ -91,6 +91,16 @@ def test_rows_that_agree_are_left_as_they_are():
     assert level.rectifier is rectifier
 
 
+def test_few_matches_correct_nothing_that_may_be_chance():
+    given, rng = rig(), np.random.default_rng(3)
+    matches = matches_of(given, given).select(np.arange(60))
+    matches.right[:, 1] += rng.normal(scale=3.0, size=60)
+    level = level_eyes(matches, StereoRectifier(given))
+    # Roll and size are off by more than usual, and by less than that scatter.
+    assert max(abs(level.fit.roll), abs(level.fit.zoom)) > 1.0
+    assert level.causes == ()
+
+
 def test_no_rig_is_made_of_matches_that_follow_none():
     given = rig()
     matches = matches_of(given, given)
