@@ -9,7 +9,7 @@ import numpy as np
 from sigmaslam.checks.calibration import check_calibration
 from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
 from sigmaslam.checks.finding import Finding, has_errors, wrong
-from sigmaslam.checks.images import check_images, check_light, check_overlay, describe_frames
+from sigmaslam.checks.images import check_images, check_light, check_overlay, describe_frames, light_ratio
 from sigmaslam.checks.inertial import check_inertial, check_times
 from sigmaslam.checks.inertial_agreement import check_motion
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
@@ -78,7 +78,8 @@ def check_sequence(
         return Check(findings, [], [], EyeMatches.empty(), sequence.camera)
     images = check_images([(frame.left, frame.right) for frame, _ in steps])
     frames = [frame for frame, _ in steps]
-    findings += [*images, check_light(frames), check_overlay(frames)]
+    times, light = [frame.timestamp for frame in frames], np.array([light_ratio(frame) for frame in frames])
+    findings += [*images, check_light(times, light), check_overlay(frames)]
     matches, camera = EyeMatches.empty(), sequence.camera
     if has_errors(images):
         # Features of such images would tell nothing, or the same once more.
@@ -112,7 +113,7 @@ def _check_rig(
         return check_rig(matches.unfollowed(), rectifier, interval)
     exchanged = find_exchanged(matches, rectifier)
     if 0 < len(exchanged) < len(np.unique(matches.pair)):
-        when = describe_frames([frame for frame, _ in steps], exchanged)
+        when = describe_frames([frame.timestamp for frame, _ in steps], exchanged)
         message = f"left and right are exchanged in {when}, and not in the others: what wrote them mixes up the cameras"
         rest = matches.select(~np.isin(matches.pair, exchanged))
         findings, camera = _check_rig(rest, steps, matcher, interval, wrong_calibration)

@@ -102,26 +102,36 @@ def check_overlay(frames: Sequence[StereoFrame]) -> Finding:
     return Finding("overlay", "warning", message, share)
 
 
-def check_light(frames: Sequence[StereoFrame]) -> Finding:
-    """Whether one eye is darker than the other, in all frames or in some."""
-    ratios = np.array([(1.0 + frame.left.mean()) / (1.0 + frame.right.mean()) for frame in frames])
+def light_ratio(frame: StereoFrame) -> float:
+    """Light of the left eye over that of the right one, by some of their pixels."""
+    left, right = (float(image[::4, ::4].mean()) for image in (frame.left, frame.right))
+    return (1.0 + left) / (1.0 + right)
+
+
+def check_light(seconds: Sequence[float], ratios: np.ndarray, most: float = 0.0) -> Finding:
+    """Whether one eye is darker than the other, in more than a share of the frames.
+
+    Args:
+        seconds: of the frames.
+        ratios: (N,) as of `light_ratio`.
+    """
     uneven = np.flatnonzero(np.maximum(ratios, 1.0 / ratios) > _MAX_LIGHT)
-    if not len(uneven):
+    if len(uneven) <= most * len(ratios):
         ratio = float(np.median(ratios))
         return Finding("light", "ok", f"left images are {ratio:.2f} times as bright as right ones", ratio)
     ratio = float(np.median(ratios[uneven]))
     dark, times = ("right", ratio) if ratio > 1.0 else ("left", 1.0 / ratio)
     message = (
-        f"the {dark} eye is {times:.1f} times darker than the other in {describe_frames(frames, uneven)}: give both "
+        f"the {dark} eye is {times:.1f} times darker than the other in {describe_frames(seconds, uneven)}: give both "
         "the same exposure, gain and aperture"
     )
     return Finding("light", "warning", message, ratio)
 
 
-def describe_frames(frames: Sequence[StereoFrame], chosen: np.ndarray) -> str:
-    """How many frames of those that were looked at are meant, and when, by their indices."""
-    first, last = (frames[k].timestamp - frames[0].timestamp for k in chosen[[0, -1]])
-    return f"{len(chosen)} of {len(frames)} frames that were looked at ({first:.1f} to {last:.1f} s)"
+def describe_frames(seconds: Sequence[float], chosen: np.ndarray) -> str:
+    """How many frames of those that were looked at, at `seconds`, are meant, and when, by their indices."""
+    first, last = (seconds[k] - seconds[0] for k in chosen[[0, -1]])
+    return f"{len(chosen)} of {len(seconds)} frames that were looked at ({first:.1f} to {last:.1f} s)"
 
 
 def _check_sharpness(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Finding:

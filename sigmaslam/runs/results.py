@@ -20,6 +20,7 @@ from sigmaslam.run_record.inertial_file import describe_gravity, read_inertial_r
 from sigmaslam.run_record.pose_file import PARTIAL_POSES, POSES_NAME, PoseRecords, read_pose_records, write_pose_table
 from sigmaslam.run_record.relative_pose_file import PARTIAL_RELATIVE_POSES, RELATIVE_POSES_NAME, collect_frame_pairs
 from sigmaslam.run_record.verdict import calibration_verdict, expected_offset, explain_failure
+from sigmaslam.slam.doubt import Doubt
 from sigmaslam.slam.estimate import CalibrationEstimate
 from sigmaslam.slam.point_map import PointMap
 
@@ -205,6 +206,8 @@ def _summarise(
     # that one of their images is that of the frame before.
     contradicted = np.isin(status, frame_table.TRACKED) & (2.0 * columns["inliers"] < columns["matches"])
     repeated = (status == "skipped") & np.isfinite(columns["belief"])
+    # A bump skips the frame before the one that names it.
+    repeated[:-1] &= np.array([Doubt.RIG not in doubts for doubts in frames.doubts[1:]], bool)
     return {
         "frames": len(frames),
         **{each: frames.status.count(each) for each in frame_table.STATUSES},

@@ -1,11 +1,12 @@
 """Tracking a whole sequence, from disk or live, into a run folder."""
 
+import logging
 import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -15,7 +16,8 @@ from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
 from sigmaslam.calibration.learned_calibration import learned_calibration
 from sigmaslam.calibration_files.calibration_writer import write_calibration
-from sigmaslam.checks.finding import Finding, disparity_error
+from sigmaslam.checks.finding import Finding, disparity_error, wrong
+from sigmaslam.checks.images import check_light, light_ratio
 from sigmaslam.checks.inertial_agreement import judge_motion
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
 from sigmaslam.files import printable
@@ -40,6 +42,7 @@ from sigmaslam.slam.start_pose import StartPose
 from sigmaslam.slam.tracker import StereoTracker
 
 Tracker = StereoTracker | ObjectTracker
+logger = logging.getLogger(__name__)
 
 
 def track_sequence(request: TrackRequest) -> dict[str, Any]:
@@ -109,6 +112,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         run = {
             **writer.run,
             "ended": _describe_end(stopped_by),
+            "checks": [*writer.run["checks"], *_judge_light(steps.light, request.input.findings)],
             "dropped": timing.dropped + sequence.dropped,
             **timing.describe(timing.dropped + sequence.dropped),
             **_describe_location(location),
@@ -159,6 +163,17 @@ def _describe_end(stopped_by: BaseException | None) -> str:
         case SigmaSlamError():
             return f"failed: {printable(str(stopped_by))}"
     return f"crashed: {stopped_by!r}"
+
+
+def _judge_light(light: Sequence[tuple[float, float]], findings: Sequence[Finding]) -> list[dict[str, Any]]:
+    """That an eye was dark in a tenth of the frames, where no check has found it before."""
+    if not light or any(each.name == "light" for each in wrong(findings)):
+        return []
+    times, ratios = np.array(light).T
+    found = wrong([check_light(times.tolist(), ratios, most=0.1)])
+    for each in found:
+        logger.warning("%s: %s", each.name, each.message)
+    return [asdict(each) for each in found]
 
 
 def _build_tracker(
@@ -217,9 +232,11 @@ class _FrameSteps:
     timing: FrameTiming
     location: LocationFilter | None
     sensors: list[_Samples]
+    light: list[tuple[float, float]] = field(default_factory=list)
 
     def step(self, frame: StereoFrame) -> Estimate | ObjectEstimate:
         """What is said of the frame."""
+        self.light.append((frame.timestamp, light_ratio(frame)))
         if self.images is not None:
             frame = self.images.step(frame)
         for samples in self.sensors:

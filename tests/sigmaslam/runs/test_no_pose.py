@@ -229,3 +229,25 @@ def test_a_path_is_solid_where_it_was_seen_and_dashed_where_it_was_not():
     drawn = {style: set(np.flatnonzero(np.isfinite(path[:-1] + path[1:]).all(axis=1))) for style, path in lines.items()}
     # Segments: the ways to a lost frame and from it are not seen either.
     assert drawn == {"-": {0, 4}, "--": {1, 2, 3}}
+
+
+def test_an_eye_that_becomes_dark_is_named_when_the_run_has_ended(demo_sequence: Path, tmp_path: Path):
+    def darken(k: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return left, right // 3 if k >= 4 else right
+
+    track(copy_frames(demo_sequence, tmp_path / "dark", 8, darken), tmp_path / "run", "klt")
+    (found,) = json.loads((tmp_path / "run" / "run.json").read_text())["checks"]
+    assert found["figure"] == pytest.approx(3.0, abs=0.1)
+    assert "darker than the other in 4 of 8 frames" in found["message"]
+    track(copy_frames(demo_sequence, tmp_path / "good", 8), tmp_path / "other", "klt")
+    assert json.loads((tmp_path / "other" / "run.json").read_text())["checks"] == []
+
+
+@pytest.mark.long
+def test_a_bump_is_not_called_an_image_that_comes_again(demo_sequence: Path, tmp_path: Path):
+    def lower(k: int, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return left, np.roll(right, 3 if k >= 8 else 0, axis=0)
+
+    summary = track(copy_frames(demo_sequence, tmp_path / "sequence", 14, lower), tmp_path / "run")
+    assert (summary["skipped"], summary["repeated"]) == (1, 0)
+    assert "rig changed" in summary["doubts"]
