@@ -14,8 +14,6 @@ from sigmaslam_benchmarks.tracking.page import fill_page, number
 
 # In the order of the page; a starting frame has no pose yet.
 _STATUSES = ("tracking", "doubtful", "ambiguous", "relocalised", "lost", "skipped", "refused")
-# Sentences of a case that the page shows: those that most of its runs have.
-_SENTENCES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,17 +96,19 @@ def _case_rows(page: LivePage, method: str) -> Iterator[list[str]]:
 
 
 def _words(page: LivePage) -> Iterator[tuple[str, str]]:
-    """What the first method says of each case and not of most good frames, and of how many recordings."""
+    """What the first method says of most recordings with a fault and not of most good frames, and of how many."""
     usual = _sentences(page.judgements(page.methods[0], NO_FAULT).values())
     for case in page.cases:
         results = page.judgements(page.methods[0], case).values()
-        said = [
-            f"{words} ({count} of {len(results)})"
-            for key, (words, count) in sorted(_sentences(results).items(), key=lambda item: -item[1][1])
-            if 2 * usual.get(key, ("", 0))[1] < len(results)
-        ]
+        said = {
+            key: f"{words} ({count} of {len(results)})"
+            for key, (words, count) in _sentences(results).items()
+            if 2 * usual.get(key, ("", 0))[1] < len(results) < 2 * count and "framestracked" not in key
+        }
+        # Of a warning and the summary that repeats it one is enough.
+        words = [words for key, words in said.items() if not any(key in other for other in said if other != key)]
         if results:
-            yield case, " / ".join(said[:_SENTENCES]).replace("|", "\\|").replace("\n", " ") or "nothing"
+            yield case, " / ".join(words).replace("|", "\\|").replace("\n", " ") or "nothing"
 
 
 def _sentences(results: Iterable[Judgement]) -> dict[str, tuple[str, int]]:
@@ -116,7 +116,7 @@ def _sentences(results: Iterable[Judgement]) -> dict[str, tuple[str, int]]:
     found: dict[str, tuple[str, int]] = {}
     for result in results:
         said = [*result.said, *([f"refused: {result.refused}"] if result.refused else [])]
-        for key, words in {re.sub(r"[-+]?\d+(\.\d+)?", "#", each): each for each in said}.items():
+        for key, words in {re.sub(r"[-+]?\d+(\.\d+)?|\W", "", each).lower(): each for each in said}.items():
             first, count = found.get(key, (words, 0))
             found[key] = first, count + 1
     return found
