@@ -1,7 +1,6 @@
 """The right camera as the matches have it: turned, moved or enlarged until both eyes see a place in the same row."""
 
 from dataclasses import dataclass, replace
-from itertools import compress
 
 import cv2
 import numpy as np
@@ -11,19 +10,16 @@ from sigmaslam.checks.hypotheses import rectified_places, stored_places
 from sigmaslam.checks.row_fit import SIGNIFICANT, RowFit, fit_rows
 from sigmaslam.errors import CalibrationError
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
-from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rigid_motion
 
 WARN_ROWS = 0.5 * ROW_TOLERANCE
 """The tracker searches rows within ROW_TOLERANCE: further off, an error; from half of it on, a warning."""
-# What is wrong by more than so many of the usual standard deviations is no error that calibrations usually have.
+# Standard deviations.
 _CREDIBLE = 4.0
 # The fit is of first order: of a turn by five degrees a hundredth of a pixel is left after so many.
 _ROUNDS = 4
-# In the order of `RowFit.sigmas`.
-_CAUSES = ("shift", "roll", "zoom", "yaw")
 # So many of the matches must lie in one row then.
 _LEVEL = 0.5
 
@@ -48,18 +44,22 @@ class LevelledEyes:
 def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
     """Corrects the right camera by what moves rows; the rig as it is where all agree, or nothing makes most agree.
 
-    Rows that are all lower are those of a pitch or of another principal point, whichever leaves less. Lenses bend rows
-    as a yaw does, by up to what is warned of.
+    What is significant is corrected beyond four of the standard deviations that the calibration claims, and where it
+    moves rows by what is warned of; a yaw from there on alone, as lenses bend rows so, too. Rows that are all lower are
+    those of a pitch or of another principal point, whichever leaves less.
 
     Args:
         matches: in the images of `rectifier`.
     """
-    given = LevelledEyes(rectifier, matches, fit_rows(matches, rectifier.rectified))
-    usual, focal, sizes = CalibrationSigmas(), rectifier.rectified.fx, np.abs([getattr(given.fit, k) for k in _CAUSES])
-    limits = _CREDIBLE * focal * np.array([usual.rotation, usual.rotation, usual.distortion, 0.0])
-    is_wrong = sizes > np.maximum(limits, SIGNIFICANT * given.fit.sigmas[: len(_CAUSES)])
-    is_wrong[-1] &= given.fit.most("yaw") > WARN_ROWS
-    causes = tuple(compress(_CAUSES, is_wrong))
+    fit, focal, sigmas = fit_rows(matches, rectifier.rectified), rectifier.rectified.fx, rectifier.camera.sigmas
+    claimed = {"shift": sigmas.rotation, "roll": sigmas.rotation, "zoom": sigmas.distortion, "yaw": np.inf}
+    sizes = {name: abs(getattr(fit, name)) for name in claimed}
+    causes = tuple(
+        name
+        for (name, size), sigma in zip(sizes.items(), fit.sigmas[:4].tolist(), strict=True)
+        if size > SIGNIFICANT * sigma and (size > _CREDIBLE * focal * claimed[name] or fit.most(name) > WARN_ROWS)
+    )
+    given = LevelledEyes(rectifier, matches, fit)
     stored, found, least = stored_places(matches, rectifier), [given], np.median(np.abs(matches.row_difference))
     for is_turned in (True, False) if "shift" in causes else (True,) if causes else ():
         eyes = replace(given, causes=causes)
@@ -79,7 +79,9 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
 def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:
     """The camera without what the fit has left of the causes; a shift is that of a turn, or of the principal point."""
     camera, focal = eyes.rectifier.camera, eyes.rectifier.rectified.fx
-    shift, roll, zoom, yaw = (getattr(eyes.fit, name) / focal * (name in eyes.causes) for name in _CAUSES)
+    shift, roll, zoom, yaw = (
+        getattr(eyes.fit, name) / focal * (name in eyes.causes) for name in ("shift", "roll", "zoom", "yaw")
+    )
     right, to_right = camera.right, eyes.rectifier.R_rectified_right
     right = replace(right, fx=(1.0 + zoom) * right.fx, fy=(1.0 + zoom) * right.fy)
     right = right if is_turned else replace(right, cy=right.cy + shift * right.fy)

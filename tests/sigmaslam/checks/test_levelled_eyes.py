@@ -10,6 +10,7 @@ from sigmaslam.checks import check_sequence
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.levelled_eyes import level_eyes
 from sigmaslam.checks.rig import check_rig
+from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rigid_motion
@@ -89,6 +90,16 @@ def test_rows_that_agree_are_left_as_they_are():
     level = level_eyes(matches_of(rig(LENS, (0.05, 0.0, 0.05)), given), rectifier)
     assert level.causes == ()
     assert level.rectifier is rectifier
+
+
+def test_a_calibration_is_held_to_what_it_claims():
+    true = rig(LENS, (0.0, 0.0, 0.06))
+    for claimed, causes in ((CalibrationSigmas(), ()), (CalibrationSigmas.none(), ("roll",))):
+        given = replace(rig(LENS), sigmas=claimed)
+        assert level_eyes(matches_of(true, given), StereoRectifier(given)).causes == causes
+    # However little a calibration claims, rows beyond what is searched are corrected.
+    given = replace(rig(LENS), sigmas=CalibrationSigmas(rotation=0.1))
+    assert level_eyes(matches_of(rig(LENS, (1.0, 0.0, 0.0)), given), StereoRectifier(given)).causes == ("shift",)
 
 
 def test_few_matches_correct_nothing_that_may_be_chance():
