@@ -95,7 +95,7 @@ def check_sequence(
             rig, camera = _check_rig(matches, steps, matcher, interval, {each.name for each in wrong(calibration)})
             findings += rig
             if track_imu and sequence.imu is not None:
-                findings += check_motion(sequence, threads)
+                findings += check_motion(sequence, camera, threads)
     rectified = [rectifier.rectify(frame.left, frame.right) for frame, _ in steps]
     return Check(findings, steps, rectified, matches, camera)
 

@@ -70,7 +70,7 @@ def explain(findings: Sequence[Finding]) -> str:
 
     All warnings where there is no error; empty where there is neither.
     """
-    ranked = wrong(findings)
+    ranked = [each for each in wrong(findings) if each.pixels != 0.0]  # what is corrected hinders nothing
     errors = [number for number, each in enumerate(ranked) if each.severity == "error"]
     chosen = [each for number, each in enumerate(ranked) if not errors or number <= errors[-1]]
     return "\n".join(each.message for each in chosen)

@@ -6,6 +6,7 @@ from sigmaslam.checks.finding import Finding
 from sigmaslam.estimation.accelerometer_axes import SIGNED_AXES, fit_axes
 from sigmaslam.estimation.inertial_motion import SENSOR_SIGMA
 from sigmaslam.estimation.inertial_turns import TurnFit, fit_turns
+from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.se3 import nearest_rotation, rotation_log
 from sigmaslam.progress import counted
 from sigmaslam.readers.inertial import InertialRecording
@@ -33,12 +34,12 @@ _LEAST_POSES = 8
 _FRAMES = 50
 
 
-def check_motion(sequence: StereoSequence, threads: int = 2) -> list[Finding]:
-    """The findings of `judge_motion` from a few seconds of a sequence, tracked without its inertial sensor."""
+def check_motion(sequence: StereoSequence, camera: StereoCamera, threads: int = 2) -> list[Finding]:
+    """The findings of `judge_motion` from a few seconds of a sequence, tracked by `camera` alone."""
     assert sequence.imu is not None
     first = 0 if sequence.timestamps is None else _liveliest(np.asarray(sequence.timestamps), sequence.imu)
     part = sequence.select(Selection(first, _FRAMES))
-    tracker = StereoTracker(sequence.camera, threads=threads)
+    tracker = StereoTracker(camera, threads=threads)
     with counted("motion", part.length) as done:
         estimates = []
         for frame in part.frames():

@@ -7,7 +7,7 @@ import numpy as np
 
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.hypotheses import rectified_places, stored_places
-from sigmaslam.checks.row_fit import SIGNIFICANT, RowFit, fit_rows
+from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows
 from sigmaslam.errors import CalibrationError
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.geometry.camera import StereoCamera
@@ -46,13 +46,19 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
 
     What is significant is corrected beyond four of the standard deviations that the calibration claims, and where it
     moves rows by what is warned of; a yaw from there on alone, as lenses bend rows so, too. Rows that are all lower are
-    those of a pitch or of another principal point, whichever leaves less.
+    those of a pitch or of another principal point, whichever leaves less; another size is that of fy alone where this
+    makes pixels as square as the left ones, which rows cannot tell.
 
     Args:
         matches: in the images of `rectifier`.
     """
-    fit, focal, sigmas = fit_rows(matches, rectifier.rectified), rectifier.rectified.fx, rectifier.camera.sigmas
-    claimed = {"shift": sigmas.rotation, "roll": sigmas.rotation, "zoom": sigmas.distortion, "yaw": np.inf}
+    fit, focal, camera = fit_rows(matches, rectifier.rectified), rectifier.rectified.fx, rectifier.camera
+    claimed = {"shift": camera.sigmas.rotation, "roll": camera.sigmas.rotation, "zoom": camera.sigmas.distortion}
+    if camera.covariance is not None:
+        measured = dict(zip(camera.covariance.names, np.sqrt(np.diag(camera.covariance.matrix)).tolist(), strict=True))
+        names = (("shift", "pitch"), ("roll", "roll"), ("zoom", "zoom"))
+        claimed = {name: max(claimed[name], measured.get(error, 0.0)) for name, error in names}
+    claimed["yaw"] = np.inf
     sizes = {name: abs(getattr(fit, name)) for name in claimed}
     causes = tuple(
         name
@@ -67,11 +73,13 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
             for _ in range(_ROUNDS):
                 other = StereoRectifier(_corrected(eyes, is_turned))
                 moved = rectified_places(matches, stored, other)
+                if len(moved) < MIN_MATCHES:
+                    raise CalibrationError("the corrected eyes see nothing together")
                 eyes = LevelledEyes(other, moved, fit_rows(moved, other.rectified), causes)
         except CalibrationError:  # no rig that could be
             continue
         rows = np.abs(moved.row_difference)
-        if len(rows) and float((rows <= WARN_ROWS).mean()) > _LEVEL and np.median(rows) < least:
+        if float((rows <= WARN_ROWS).mean()) > _LEVEL and np.median(rows) < least:
             found.append(eyes)
     return min(found[1:] or found, key=lambda eyes: float(np.median(np.abs(eyes.fit.residual))))
 
@@ -83,7 +91,9 @@ def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:
         getattr(eyes.fit, name) / focal * (name in eyes.causes) for name in ("shift", "roll", "zoom", "yaw")
     )
     right, to_right = camera.right, eyes.rectifier.R_rectified_right
-    right = replace(right, fx=(1.0 + zoom) * right.fx, fy=(1.0 + zoom) * right.fy)
+    aspect = right.fy / right.fx * camera.left.fx / camera.left.fy - 1.0
+    wider = zoom * (abs(aspect) < 0.5 * abs(zoom))
+    right = replace(right, fx=(1.0 + wider) * right.fx, fy=(1.0 + zoom) * right.fy)
     right = right if is_turned else replace(right, cy=right.cy + shift * right.fy)
     turn, _ = cv2.Rodrigues(np.array([shift * is_turned, -yaw, -roll]))
     R = camera.T_left_right[:3, :3] @ to_right.T @ turn @ to_right

@@ -76,7 +76,7 @@ def check_rig(
     if findings[-1].severity not in ("ok", "unknown"):
         return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:]), rectifier.camera
     camera, view = level.rectifier.camera, level.rectifier.rectified
-    rows = _check_rows(given, level, view.fx)
+    rows = _check_rows(given, level, rectifier.rectified.fx)
     infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
     if level.fit.most("roll", "yaw") <= WARN_ROWS:
         infinity = _check_infinity(level.fit)
@@ -262,8 +262,8 @@ def _check_infinity(fit: RowFit) -> Finding:
         "eye or the yaw of the right camera is wrong: calibrate again"
     )
     if behind <= _MAX_BEHIND:
-        return Finding("infinity", "warning", message, behind, -lowest)
-    return Finding("infinity", "error", f"{message}; {_CORRECTED}, until the least is 0", behind, -lowest)
+        return Finding("infinity", "warning", message, behind)
+    return Finding("infinity", "error", f"{message}; until then the least is taken for 0", behind, -lowest)
 
 
 def _agreement(matches: EyeMatches, view: RectifiedStereo) -> float:

@@ -212,7 +212,7 @@ class StereoSequence:
         if mismatch:
             raise FrameError(f"{name}: {mismatch}")
         grey = self._grey.convert(image, name)
-        if wanted is model:
+        if (wanted.width, wanted.height) == (model.width, model.height):
             return grey
         return np.asarray(cv2.resize(grey, (wanted.width, wanted.height), interpolation=cv2.INTER_AREA))
 

@@ -164,6 +164,7 @@ def _check_entries(folder: Path, entries: dict[str, Any], run: dict[str, Any]) -
         had, has = entries.get(name), run.get(name)
         if had != has:
             values = f" ({had}, now {has})" if isinstance(has or had, str) else ""
+            values += " or --start, --frames, by which rows are corrected" * (name == "calibration")
             raise InputError(f"{folder / RUN_NAME}: had another {name}{values}: give the same, or another --out")
 
 

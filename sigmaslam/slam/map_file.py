@@ -107,7 +107,7 @@ def read_keyframes(
     if not np.allclose(arrays["intrinsics"], expected, rtol=1e-4):
         raise InputError(
             f"{path}: its camera has fx, fy, cx, cy, baseline, width, height of {arrays['intrinsics'].tolist()}, this "
-            f"one {expected.tolist()}; a map serves the camera that made it"
+            f"one {expected.tolist()}; a map serves the camera that made it (rows corrected: of --save-calibration)"
         )
     _check(path, arrays)
     if not arrays[_PREFIX + "descriptors"].shape[1]:

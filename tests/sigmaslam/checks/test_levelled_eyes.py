@@ -10,6 +10,7 @@ from sigmaslam.checks import check_sequence
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.levelled_eyes import level_eyes
 from sigmaslam.checks.rig import check_rig
+from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -83,6 +84,17 @@ def test_an_enlarged_right_image_is_no_turn():
     assert level.rectifier.camera.right.fy == pytest.approx(515.0, abs=0.3)
 
 
+def test_an_image_that_is_stretched_down_alone_is_not_widened():
+    given, true = rig(LENS), rig(LENS)
+    true = replace(true, right=replace(true.right, fy=1.03 * 500.0))
+    right = level_eyes(matches_of(true, given), StereoRectifier(given)).rectifier.camera.right
+    # Pixels were given as square, and rows cannot tell: the wider image bends rows at the border, too.
+    assert (right.fx, right.fy) == (pytest.approx(515.0, abs=1.0), pytest.approx(515.0, abs=1.0))
+    given = replace(given, right=replace(given.right, fy=0.97 * 500.0))
+    right = level_eyes(matches_of(rig(LENS), given), StereoRectifier(given)).rectifier.camera.right
+    assert (right.fx, right.fy) == (pytest.approx(500.0, abs=0.5), pytest.approx(500.0, abs=0.5))
+
+
 def test_rows_that_agree_are_left_as_they_are():
     given = rig(LENS)
     rectifier = StereoRectifier(given)
@@ -97,6 +109,9 @@ def test_a_calibration_is_held_to_what_it_claims():
     for claimed, causes in ((CalibrationSigmas(), ()), (CalibrationSigmas.none(), ("roll",))):
         given = replace(rig(LENS), sigmas=claimed)
         assert level_eyes(matches_of(true, given), StereoRectifier(given)).causes == causes
+    measured = CalibrationCovariance(("roll",), np.diag([0.01**2]))
+    given = replace(rig(LENS), covariance=measured)
+    assert level_eyes(matches_of(rig(LENS, (0.0, 0.0, 0.2)), given), StereoRectifier(given)).causes == ()
     # However little a calibration claims, rows beyond what is searched are corrected.
     given = replace(rig(LENS), sigmas=CalibrationSigmas(rotation=0.1))
     assert level_eyes(matches_of(rig(LENS, (1.0, 0.0, 0.0)), given), StereoRectifier(given)).causes == ("shift",)
@@ -117,6 +132,18 @@ def test_no_rig_is_made_of_matches_that_follow_none():
     matches = matches_of(given, given)
     matches.right[:] = np.random.default_rng(1).uniform((0, 0), (640, 480), matches.right.shape)
     assert level_eyes(matches, StereoRectifier(given)).causes == ()
+
+
+@pytest.mark.long
+def test_a_rig_that_nothing_could_be_is_left_as_it_is():
+    given, rng = rig(), np.random.default_rng(0)
+    matches = matches_of(given, given).select(np.arange(60))
+    for _ in range(20):
+        roll, yaw = rng.uniform(-800.0, 800.0, 2)
+        x, y = ((matches.right - (319.5, 239.5)) / 500.0).T
+        bent = replace(matches, right=matches.right + np.stack([0.0 * x, roll * x + yaw * x * y], 1))
+        _, camera = check_rig(bent, StereoRectifier(given), None)
+        assert np.isfinite(camera.T_left_right).all()
 
 
 def test_what_is_corrected_is_said_and_hinders_nothing():
