@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from sigmaslam_benchmarks.live.driver_faults import NO_FAULT
 from sigmaslam_benchmarks.live.judge import Judgement
-from sigmaslam_benchmarks.live.live_page import LivePage
+from sigmaslam_benchmarks.live.live_page import LivePage, sentences_of, words_cell
 from sigmaslam_benchmarks.live.recordings import Recording
 from sigmaslam_benchmarks.tracking.page import fill_page, number
 
@@ -55,8 +55,7 @@ def _words(page: LivePage, recording: Recording) -> Iterator[tuple[str, str]]:
     for case in page.cases:
         result = page.found.get((recording, page.methods[0], case))
         if isinstance(result, Judgement):
-            said = [*result.said, *([f"refused: {result.refused}"] if result.refused else [])]
-            yield case, " / ".join(said).replace("|", "\\|").replace("\n", " ") or "nothing"
+            yield case, words_cell(sentences_of(result))
 
 
 def _errors(result: Judgement) -> str:

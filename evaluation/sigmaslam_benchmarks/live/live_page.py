@@ -108,15 +108,25 @@ def _words(page: LivePage) -> Iterator[tuple[str, str]]:
         # Of a warning and the summary that repeats it one is enough.
         words = [words for key, words in said.items() if not any(key in other for other in said if other != key)]
         if results:
-            yield case, " / ".join(words).replace("|", "\\|").replace("\n", " ") or "nothing"
+            yield case, words_cell(words)
+
+
+def sentences_of(result: Judgement) -> list[str]:
+    """What was said of a run, and why it broke off."""
+    return [*result.said, *([f"refused: {result.refused}"] if result.refused else [])]
+
+
+def words_cell(sentences: Iterable[str]) -> str:
+    """Sentences as one cell."""
+    return " / ".join(sentences).replace("|", "\\|").replace("\n", " ") or "nothing"
 
 
 def _sentences(results: Iterable[Judgement]) -> dict[str, tuple[str, int]]:
     """By sentence without its numbers: the first one, and how many results have it."""
     found: dict[str, tuple[str, int]] = {}
     for result in results:
-        said = [*result.said, *([f"refused: {result.refused}"] if result.refused else [])]
-        for key, words in {re.sub(r"[-+]?\d+(\.\d+)?|\W", "", each).lower(): each for each in said}.items():
+        keys = {re.sub(r"[-+]?\d+(\.\d+)?|\W", "", each).lower(): each for each in sentences_of(result)}
+        for key, words in keys.items():
             first, count = found.get(key, (words, 0))
             found[key] = first, count + 1
     return found
