@@ -112,7 +112,7 @@ def track_sequence(request: TrackRequest) -> dict[str, Any]:
         run = {
             **writer.run,
             "ended": _describe_end(stopped_by),
-            "checks": [*writer.run["checks"], *_judge_light(steps.light * (stopped is None), request.input.findings)],
+            "checks": [*writer.run["checks"], *_judge_light([] if stopped else steps.light, request.input.findings)],
             "dropped": timing.dropped + sequence.dropped,
             **timing.describe(timing.dropped + sequence.dropped),
             **_describe_location(location),
