@@ -20,6 +20,8 @@ _LOGGER = logging.getLogger(__name__)
 
 # Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
 _ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 5
+# Sooner in so many, whose 27 coordinates are more than twice the unknowns.
+_SOON_SECONDS, _SOON_POSES = 0.4, 9
 # Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
 _LONGEST = 10.0
 # m/s^2, standard deviation of an accelerometer's bias: data sheets of small sensors say 0.02 to 0.5.
@@ -200,7 +202,8 @@ class GravitySearch:
         ):
             del self.poses[0]
         times, poses = [each[0] for each in self.poses], np.array([pose for _, pose in self.poses])
-        if len(times) < _ALIGNED_POSES or time - times[0] < 0.9 * _ALIGNED_SECONDS:
+        seconds, is_soon = time - times[0], len(times) >= _SOON_POSES
+        if len(times) < _ALIGNED_POSES or seconds < (_SOON_SECONDS if is_soon else 0.9 * _ALIGNED_SECONDS):
             return None
         bodies = poses @ T_camera_imu
         bias, whole = np.zeros(3), list[Preintegrated]()

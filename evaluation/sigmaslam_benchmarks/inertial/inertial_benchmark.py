@@ -17,7 +17,7 @@ _RATE = 200.0
 # What happens in the dark does not depend on how long it stays: one run is judged after each of these seconds.
 _STRETCHES: tuple[tuple[float, ...], ...] = ((0.0,), (0.5, 1.0, 2.0), (5.0,))
 # A second of darkness, which goals are for, begins in MH_01 at all of these frames, a longer one at every second one.
-_STARTS = {"room": (56,), "street": (28,), "mh01": (20, 30, 40, 50, 60, 70)}
+_STARTS = {"room": (56,), "street": (28,), "mh01": (10, 20, 30, 40, 50, 60, 70)}
 _MH01_STRETCHES: tuple[tuple[float, ...], ...] = ((0.0,), (0.5, 1.0), (2.0,))
 _LEAST_AFTER = 5
 _JUDGING = (Path(__file__).with_name("dark_runs.py"),)
