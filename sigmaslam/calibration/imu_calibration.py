@@ -8,7 +8,6 @@ poses, gyro and accelerometer are is estimated with the rest (variance component
 Photogrammetric Computer Vision, 2016, section 4.2.4).
 """
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -23,7 +22,6 @@ from sigmaslam.geometry.inertial_sensor import STANDARD_GRAVITY, InertialSamples
 from sigmaslam.geometry.se3 import nearest_rotation, rotation_exp, rotation_log, se3_exp, se3_inverse, se3_log, skew
 from sigmaslam.table import Table
 
-_LOGGER = logging.getLogger(__name__)
 NAMES = ("delay", *(f"{part}_{axis}" for part in ("rotation", "lever") for axis in "xyz"))
 """Of the calibration: seconds; radians, of T_cam_imu from the right; metres."""
 MAX_ROUNDS = 25
@@ -38,8 +36,8 @@ _FIRST_SCALE, _CONVERGED = 25.0, 1e-6
 # So many rounds integrate the samples anew; after them biases and delay hardly move, and the first order will do.
 _INTEGRATED = 3
 # Turns that are off by more are in another unit (focal lengths of few views are off by a tenth); those of which less is
-# explained are of another motion. Forces, m/s^2/sqrt(Hz), have 0.13 of a wrong sign or axis, MH_01's 0.003 to 0.03.
-_SCALE_TOLERANCE, _EXPLAINED, _FOREIGN_FORCE = 0.3, 0.7, 0.1
+# explained are of another motion.
+_SCALE_TOLERANCE, _EXPLAINED = 0.3, 0.7
 # Images: fewer say nothing; they lie no further apart than that, seconds.
 _FEWEST, _LONGEST = 20, 2.0
 # Power spectra of accelerations that nobody measured, across gaps, m^2/s^3 and rad^2/s^3: those of a hand.
@@ -170,8 +168,6 @@ def calibrate_imu(
         scales[1:] = np.maximum(scales[1:], 1.0)
         if moved < _CONVERGED and np.max(np.abs(scales / before - 1.0)) < 1e-2:
             break
-    if (np.sqrt(scales[2]) - 1.0) * sensor.accel_density > _FOREIGN_FORCE:
-        _LOGGER.warning("forces hardly follow the motion: are they in m/s^2, 9.81 upwards at rest, in the gyro's axes?")
     last, joint = (shared_errors * each for each in system.last_covariance())
     moves = [
         ArrowSystem(_factors(state, poses, roots, motions, sensor, scales), len(times), _SIZE, _COMMON).solve()

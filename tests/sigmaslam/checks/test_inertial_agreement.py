@@ -111,6 +111,7 @@ def test_wrong_mountings_are_named():
         (se3_inverse(T_LEFT_IMU), "invert it"),
         (T_LEFT_IMU @ se3_exp(np.array([0, 0, 0, 0.4, 0.3, -0.2])), "turned by 30."),
         (T_LEFT_IMU @ se3_exp(np.array([0, 0, 0, 0.0, 0.03, 0.0])), "turned by 1."),
+        (se3_exp(np.array([0.03, -0.04, 0, 0, 0, 0])) @ T_LEFT_IMU, "beside its place there, at (0.0"),
     ):
         faulty = wrong(judged(poses, IMAGES, replace(recording, sensor=replace(recording.sensor, T_left_imu=mounting))))
         assert [each.name for each in faulty] == ["T_cam_imu"]
@@ -164,3 +165,10 @@ def test_forty_faults_in_a_real_recording_are_named(real_data):
         findings = judged(poses[part], times[part], recording)
         assert {each.severity for each in findings} == {"ok"}, findings
     assert_named(poses[:50], times[:50], draw_faults(recording, 40))
+    for lever in 0.05 * np.concatenate([np.eye(3), -np.eye(3)]):
+        mounting = recording.sensor.T_left_imu.copy()
+        mounting[:3, 3] += lever
+        beside = replace(recording, sensor=replace(recording.sensor, T_left_imu=mounting))
+        faulty = wrong(judged(poses, times, beside))
+        assert [each.name for each in faulty] == ["T_cam_imu"]
+        assert "mm beside its place there" in faulty[0].message
