@@ -56,6 +56,14 @@ def stamp_noise(intervals: Sequence[float] | np.ndarray) -> float:
     return sigma if sigma > _BELIEVED * steps.mean() else 0.0
 
 
+def missing_frames(intervals: np.ndarray) -> int:
+    """How many frames of a regular camera are missing between stamps that can be believed, as of `stamp_noise`."""
+    usual = float(np.median(intervals)) if len(intervals) else np.inf
+    if usual > _SLOWEST or stamp_noise(intervals) > 0.0:
+        return 0
+    return int(np.sum(np.maximum(np.round(intervals / usual) - 1.0, 0.0)))
+
+
 class FrameClock:
     """Tells how long it is since the last frame, and how well that is known.
 

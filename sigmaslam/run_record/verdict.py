@@ -92,10 +92,15 @@ def times_verdict(summary: dict[str, Any]) -> str | None:
     """What drivers did to stamps and images, in words; None where nothing can be seen.
 
     Args:
-        summary: of run.json: the noise of stamps, seconds, and how many frames showed an image again.
+        summary: of run.json: the noise of stamps, seconds, and how many frames are missing or showed an image again.
     """
-    noise, repeated = summary.get("stamp_noise", 0.0), summary.get("repeated", 0)
+    noise, repeated, missing = (summary.get(name, 0) for name in ("stamp_noise", "repeated", "missing"))
     words = [f"Time {jitter_words(noise)}."] if noise > 0.0 else []
+    if missing:
+        words.append(
+            f"By their time stamps {missing} frames are missing, the longest interval is "
+            f"{summary['longest_interval']:.2g} s: does the driver drop frames, or was its clock set?"
+        )
     if repeated:
         words.append(
             f"{repeated} frames show an image of a frame before, or an eighth of one or more, to the byte, or a "

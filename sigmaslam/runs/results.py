@@ -10,7 +10,7 @@ import numpy as np
 
 from sigmaslam.checks.finding import Finding, wrong
 from sigmaslam.errors import OutputError, SigmaSlamError
-from sigmaslam.estimation.frame_clock import stamp_noise
+from sigmaslam.estimation.frame_clock import missing_frames, stamp_noise
 from sigmaslam.files import atomic_write_json, save_array, save_arrays
 from sigmaslam.geometry.trajectory import Trajectory
 from sigmaslam.readers.trajectory_files import write_kitti, write_tum
@@ -200,6 +200,7 @@ def _summarise(
 ) -> dict[str, Any]:
     """Counts for run.json."""
     columns, status = frames.columns, np.array(frames.status, str)
+    intervals = np.diff(columns["timestamp"])
     inliers = columns["inliers"][columns["inliers"] > 0]
     first = int(np.abs(columns["timestamp"] - records.timestamp[0]).argmin()) if len(records) else None
     # Of tracked frames, that fewer than half of the matches agree with the pose; of skipped ones that could be read,
@@ -218,7 +219,9 @@ def _summarise(
         "median_inliers": float(np.median(inliers)) if len(inliers) else 0.0,
         "map_points": points,
         "contradicted": int(contradicted.sum()),
-        "stamp_noise": stamp_noise(np.diff(columns["timestamp"])),
+        "stamp_noise": stamp_noise(intervals),
+        "missing": missing_frames(intervals),
+        "longest_interval": float(intervals.max(initial=0.0)),
         "repeated": int(repeated.sum()),
         "calibration_errors": {} if calibration is None else {k: list(v) for k, v in calibration.errors.items()},
     }

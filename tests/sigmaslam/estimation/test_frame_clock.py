@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sigmaslam.estimation.frame_clock import FrameClock, stamp_noise
+from sigmaslam.estimation.frame_clock import FrameClock, missing_frames, stamp_noise
 
 FRAMES = 40
 REGULAR = 0.1 * np.arange(FRAMES)
@@ -42,6 +42,21 @@ def test_intervals_that_vary_by_themselves_are_no_noise_of_stamps():
     """Neighbours do not depend on each other: the covariance is within three of its standard deviations of zero."""
     intervals = np.random.default_rng(0).uniform(0.08, 0.12, 5000)
     assert stamp_noise(intervals) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("kept", "rate", "missing"),
+    [
+        (range(40), 20.0, 0),
+        ([k for k in range(40) if k % 5], 20.0, 7),
+        ([*range(15), *range(25, 40)], 20.0, 10),
+        ([*range(15), *range(115, 140)], 20.0, 100),
+        ([0, 1, 3, 4, 8], 1.0, 0),
+    ],
+    ids=["good", "drops", "gap", "clock set", "chosen"],
+)
+def test_frames_that_are_missing_are_counted(kept: list[int], rate: float, missing: int):
+    assert missing_frames(np.diff(np.array(kept) / rate)) == missing
 
 
 @pytest.mark.parametrize(

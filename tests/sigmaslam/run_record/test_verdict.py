@@ -119,6 +119,8 @@ def test_stamps_that_jitter_and_images_that_repeat_are_said():
     assert times_verdict({"stamp_noise": 0.0, "repeated": 0}) is None
     assert "jitter by 31 ms" in times_verdict({"stamp_noise": 0.031, "repeated": 0})
     assert "10 frames" in times_verdict({"stamp_noise": 0.0, "repeated": 10})
+    said = times_verdict({"missing": 12, "longest_interval": 0.55})
+    assert "12 frames are missing, the longest interval is 0.55 s" in said
 
 
 def test_a_cause_that_evidence_names_is_said_in_place_of_the_offset():
