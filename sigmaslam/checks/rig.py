@@ -77,9 +77,9 @@ def check_rig(
         return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:]), rectifier.camera
     camera, view = level.rectifier.camera, level.rectifier.rectified
     rows = _check_rows(given, level, rectifier.rectified.fx)
-    infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
-    if level.fit.most("roll", "yaw") <= WARN_ROWS:
-        infinity = _check_infinity(level.fit)
+    infinity = _check_infinity(level.fit)
+    if level.fit.most("roll", "yaw") > WARN_ROWS and infinity.severity != "error":
+        infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
     if infinity.severity == "error" and infinity.pixels is not None and findings[0].severity == "ok":
         right = camera.right
         camera = replace(camera, right=replace(right, cx=right.cx + infinity.pixels / view.fx * right.fx))
