@@ -7,7 +7,7 @@ import numpy as np
 
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.hypotheses import rectified_places, stored_places
-from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows
+from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, curvature, fit_rows
 from sigmaslam.errors import CalibrationError
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.geometry.camera import StereoCamera
@@ -46,8 +46,8 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
 
     What is significant is corrected beyond four of the standard deviations that the calibration claims, and where it
     moves rows by what is warned of; a yaw from there on alone, as lenses bend rows so, too. Rows that are all lower are
-    those of a pitch or of another principal point, whichever leaves less; another size is that of fy alone where this
-    makes pixels as square as the left ones, which rows cannot tell.
+    those of a pitch or of another principal point, whichever leaves them less curved; another size is that of fy alone
+    where this makes pixels as square as the left ones, which rows cannot tell.
 
     Args:
         matches: in the images of `rectifier`.
@@ -59,19 +59,17 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
         names = (("shift", "pitch"), ("roll", "roll"), ("zoom", "zoom"))
         claimed = {name: max(claimed[name], measured.get(error, 0.0)) for name, error in names}
     claimed["yaw"] = np.inf
-    sizes = {name: abs(getattr(fit, name)) for name in claimed}
-    causes = tuple(
-        name
-        for (name, size), sigma in zip(sizes.items(), fit.sigmas[:4].tolist(), strict=True)
-        if size > SIGNIFICANT * sigma and (size > _CREDIBLE * focal * claimed[name] or fit.most(name) > WARN_ROWS)
-    )
-    given = LevelledEyes(rectifier, matches, fit)
+    credible = {name: _CREDIBLE * focal * sigma for name, sigma in claimed.items()}
+    given = LevelledEyes(rectifier, matches, fit, _wrong(fit, credible))
     stored, found, least = stored_places(matches, rectifier), [given], np.median(np.abs(matches.row_difference))
-    for is_turned in (True, False) if "shift" in causes else (True,) if causes else ():
-        eyes = replace(given, causes=causes)
+    for is_turned in (True, False) if "shift" in given.causes else (True,) if given.causes else ():
+        eyes = given
         try:
             for _ in range(_ROUNDS):
-                other = StereoRectifier(_corrected(eyes, is_turned))
+                # What is large may hide others.
+                more = _wrong(eyes.fit, credible)
+                causes = tuple(name for name in credible if name in eyes.causes or name in more)
+                other = StereoRectifier(_corrected(replace(eyes, causes=causes), is_turned))
                 moved = rectified_places(matches, stored, other)
                 if len(moved) < MIN_MATCHES:
                     raise CalibrationError("the corrected eyes see nothing together")
@@ -81,7 +79,19 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
         rows = np.abs(moved.row_difference)
         if float((rows <= WARN_ROWS).mean()) > _LEVEL and np.median(rows) < least:
             found.append(eyes)
-    return min(found[1:] or found, key=lambda eyes: float(np.median(np.abs(eyes.fit.residual))))
+    if len(found) == 1:
+        return replace(given, causes=())
+    return min(found[1:], key=lambda eyes: abs(curvature(eyes.matches, eyes.rectifier.rectified)))
+
+
+def _wrong(fit: RowFit, credible: dict[str, float]) -> tuple[str, ...]:
+    """Causes that are significant, and beyond what is credible of them, or of what is warned of."""
+    sizes = {name: abs(getattr(fit, name)) for name in credible}
+    return tuple(
+        name
+        for (name, size), sigma in zip(sizes.items(), fit.sigmas[:4].tolist(), strict=True)
+        if size > SIGNIFICANT * sigma and (size > credible[name] or fit.most(name) > WARN_ROWS)
+    )
 
 
 def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:

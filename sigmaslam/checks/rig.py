@@ -16,7 +16,8 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.argument_checks import MAX_DELAY
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
-# The tracker takes a pair for swapped where more than this share of the disparities is below -1 px.
+# The tracker takes a pair for swapped where more than this share of the disparities is below -1 px: from half of it on
+# cx is moved.
 _MAX_BEHIND, _WARN_BEHIND = 0.1, 0.02
 # A rig is explained by a hypothesis that this share of the matches follows, if it is so many times the share of
 # those that follow the calibration.
@@ -74,7 +75,7 @@ def check_rig(
         return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:]), rectifier.camera
     findings.append(_check_synchronisation(level.fit, frame_interval))
     if findings[-1].severity not in ("ok", "unknown"):
-        return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:]), rectifier.camera
+        return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:]), level.rectifier.camera
     camera, view = level.rectifier.camera, level.rectifier.rectified
     rows = _check_rows(given, level, rectifier.rectified.fx)
     infinity = _check_infinity(level.fit)
@@ -261,7 +262,7 @@ def _check_infinity(fit: RowFit) -> Finding:
         f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one "
         "eye or the yaw of the right camera is wrong: calibrate again"
     )
-    if behind <= _MAX_BEHIND:
+    if behind <= 0.5 * _MAX_BEHIND:
         return Finding("infinity", "warning", message, behind)
     return Finding("infinity", "error", f"{message}; until then the least is taken for 0", behind, -lowest)
 

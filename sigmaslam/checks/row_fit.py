@@ -76,10 +76,7 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
     moving = followed.sum() >= MIN_MATCHES and np.percentile(np.abs(matches.flow[followed, 1]), 90) >= _MIN_FLOW
     if moving:
         matches = matches.select(followed)
-    x, y = ((matches.right - 0.5 * np.array([camera.width - 1, camera.height - 1])) / [camera.fx, camera.fy]).T
-    flow = matches.flow if moving else np.zeros_like(matches.flow)
-    rows, chances = matches.row_difference, matches.probability
-    columns = np.column_stack([np.ones(len(matches)), x, y, x * y, flow[:, 1]])
+    rows, chances, columns = matches.row_difference, matches.probability, _columns(matches, camera, moving)
     coefficients, sigmas, count = np.zeros(5), np.full(5, np.nan), 4 + moving
     coefficients[:count], sigmas[:count] = _fit(columns[:, :count], rows, chances)
     if moving:
@@ -87,11 +84,28 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
         own = _fit(np.column_stack([columns, matches.pair[:, None] == np.unique(matches.pair)[1:]]), rows, chances)
         if abs(own[0][4] - coefficients[4]) > SIGNIFICANT * np.hypot(own[1][4], sigmas[4]):
             coefficients[4], sigmas[4] = own[0][4], own[1][4]
-            coefficients[:4], sigmas[:4] = _fit(columns[:, :4], rows - coefficients[4] * flow[:, 1], chances)
+            coefficients[:4], sigmas[:4] = _fit(columns[:, :4], rows - coefficients[4] * columns[:, 4], chances)
     shift, roll, zoom, yaw, lag = coefficients.tolist()
-    by_cause = {"shift": np.full(len(x), shift), "roll": roll * x, "yaw": yaw * x * y, "zoom": zoom * y}
+    by_cause = dict(zip(("shift", "roll", "zoom", "yaw"), (coefficients * columns).T, strict=False))
+    flow = matches.flow if moving else np.zeros_like(matches.flow)
     places = by_cause, lag * flow, rows - columns @ coefficients
     return RowFit(matches, shift, roll, zoom, yaw, lag if moving else np.nan, sigmas, *places)
+
+
+def curvature(matches: EyeMatches, camera: RectifiedStereo) -> float:
+    """Row differences with y^2, pixels: what a turn leaves that was taken for another principal point.
+
+    A delay is left out: what the road's rows move by ahead of a car goes with y^2, too.
+    """
+    columns = _columns(matches, camera, moving=False)
+    columns[:, 4] = columns[:, 2] ** 2
+    return float(_fit(columns, matches.row_difference, matches.probability)[0][4])
+
+
+def _columns(matches: EyeMatches, camera: RectifiedStereo, moving: bool) -> np.ndarray:
+    """(M, 5) what a unit of shift, roll, zoom, yaw and lag makes of rows; nothing of a lag that does not show."""
+    x, y = ((matches.right - 0.5 * np.array([camera.width - 1, camera.height - 1])) / [camera.fx, camera.fy]).T
+    return np.column_stack([np.ones(len(x)), x, y, x * y, matches.flow[:, 1] if moving else np.zeros(len(x))])
 
 
 def _fit(columns: np.ndarray, values: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ import pytest
 
 from sigmaslam.checks import check_sequence
 from sigmaslam.checks.eye_matches import EyeMatches
+from sigmaslam.checks.finding import wrong
 from sigmaslam.checks.levelled_eyes import level_eyes
 from sigmaslam.checks.rig import check_rig
 from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
@@ -15,6 +16,8 @@ from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.geometry.se3 import rigid_motion
+from sigmaslam.readers import open_sequence
+from sigmaslam.readers.selection import Selection
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.estimates import Demo
 from tests.support.injected_faults import FAULTS, sequence_of
@@ -82,6 +85,33 @@ def test_an_enlarged_right_image_is_no_turn():
     level = level_eyes(matches_of(true, given), StereoRectifier(given))
     assert level.causes == ("zoom",)
     assert level.rectifier.camera.right.fy == pytest.approx(515.0, abs=0.3)
+
+
+@pytest.mark.long
+def test_lenses_that_bend_rows_hide_no_fault_of_a_highway_camera(real_data):
+    """KITTI 01: rows bent as by half a degree of yaw, and a road whose rows go with y^2, as a pitch's and a delay's do."""
+    sequence = open_sequence(real_data / "kitti_odometry_01_f000_050").select(Selection(count=17))
+    given = sequence.camera
+    turn = rigid_motion(cv2.Rodrigues(np.radians((0.45, 0.0, 0.0)))[0], np.zeros(3))
+    sequence.camera = replace(given, T_left_right=given.T_left_right @ turn)
+    check = check_sequence(sequence, 4, 1)
+    np.testing.assert_array_less(np.abs(turned_by(check.camera, given)), (0.03, 0.05, 0.05))
+    assert check.camera.right.cy == given.right.cy
+    assert not [each for each in wrong(check.findings) if each.name == "synchronisation"]
+    sequence.camera = replace(given, right=replace(given.right, cx=given.right.cx - 4.0))
+    assert check_sequence(sequence, 4, 1).camera.right.cx - given.right.cx == pytest.approx(0.0, abs=3.0)
+
+
+@pytest.mark.long
+def test_a_size_that_a_large_shift_hides_is_corrected(real_data):
+    sequence = open_sequence(real_data / "euroc_mh01_f000_099").select(Selection(count=17))
+    given = sequence.camera
+    turn = rigid_motion(cv2.Rodrigues(np.radians((0.28, 0.0, -0.14)))[0], np.zeros(3))
+    right = replace(given.right, fx=1.0094 * given.right.fx, fy=1.0094 * given.right.fy, cy=given.right.cy + 7.5)
+    sequence.camera = replace(given, right=right, T_left_right=given.T_left_right @ turn)
+    check = check_sequence(sequence, 4, 1)
+    assert check.camera.right.fy == pytest.approx(given.right.fy, rel=2e-3)
+    assert np.median(np.abs(check.matches.row_difference)) > 5.0  # as they were given
 
 
 def test_an_image_that_is_stretched_down_alone_is_not_widened():
