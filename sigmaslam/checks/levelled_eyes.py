@@ -107,4 +107,6 @@ def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:
     right = right if is_turned else replace(right, cy=right.cy + shift * right.fy)
     turn, _ = cv2.Rodrigues(np.array([shift * is_turned, -yaw, -roll]))
     R = camera.T_left_right[:3, :3] @ to_right.T @ turn @ to_right
-    return replace(camera, right=right, T_left_right=rigid_motion(R, camera.T_left_right[:3, 3]))
+    # If the left eye is the wrong one, the scale is: as likely as not.
+    sigmas = replace(camera.sigmas, focal=float(np.hypot(camera.sigmas.focal, wider / np.sqrt(2.0))))
+    return replace(camera, right=right, T_left_right=rigid_motion(R, camera.T_left_right[:3, 3]), sigmas=sigmas)
