@@ -12,6 +12,8 @@ from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 _FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 3.0
 # So many times the densities' variance is no noise any more but another fault.
 _LARGEST_SCALE = 1e4
+# Seconds before a motion whose samples tell by how much those in a gap may have changed.
+_RECENT = 1.0
 
 
 class InertialBuffer(SampleBuffer):
@@ -32,9 +34,9 @@ class InertialBuffer(SampleBuffer):
             biases: (6,) of gyro and accelerometer.
             densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
         """
-        table = self.around(start, end)
+        table = self.around(start - _RECENT, end)
         start, end = start + self.time_shift, end + self.time_shift
-        if len(table) < 2:
+        if len(table) < 2 or table[-1, 0] <= start:
             return None
         measured = (table[:, 1:] - biases).reshape(-1, 2, 3).transpose(1, 0, 2)
         gyro, accel = measured - measured @ self.factors.transpose(0, 2, 1)

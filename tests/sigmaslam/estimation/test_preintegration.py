@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from sigmaslam.estimation.inertial_buffer import InertialBuffer
 from sigmaslam.estimation.preintegration import Preintegrated, preintegrate
 from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import rotation_log
@@ -97,6 +98,20 @@ def test_a_gap_is_bridged_and_makes_the_motion_less_certain():
         sigma = np.sqrt(np.diag(found.gyro_noise + found.accel_noise))[:6]
         assert (np.abs(difference) < 4 * sigma).all()
         assert (sigma > 3 * np.sqrt(np.diag(exact.gyro_noise + exact.accel_noise))[:6]).all()
+
+
+def test_frames_within_a_gap_know_by_how_much_samples_changed_before_it():
+    squared = []
+    for seed in range(20, 40):
+        whole, buffer = Motion(seed).measure(np.arange(0, 3, 0.005)), InertialBuffer(SENSOR)
+        gap = whole.select((whole.timestamp < 1.8) | (whole.timestamp > 2.0))
+        for sample in zip(gap.timestamp.tolist(), gap.gyro, gap.accel, strict=True):
+            buffer.add(*sample)
+        # A quarter of it, the ends of which may be alike.
+        found, exact = buffer.preintegrate(1.85, 1.9, np.zeros(6), DENSITIES), integrate(whole, 1.85, 1.9)
+        sigma = np.sqrt(np.diag(found.gyro_noise + found.accel_noise))[:6]
+        squared.append((np.r_[rotation_log(exact.turn.T @ found.turn), found.velocity - exact.velocity] / sigma) ** 2)
+    assert np.max(squared) < 4.0**2
 
 
 def test_a_gap_too_long_to_bridge_is_missing():
