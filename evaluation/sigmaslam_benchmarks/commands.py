@@ -94,7 +94,7 @@ _TRAIN = ("train",)
 _FAULTS = (
     _DATA_IF_ANY,
     _names("cases", "Names of faults, with commas: none, ..."),
-    _names("sequences", "room, street, drive or mh01, with commas."),
+    _names("sequences", "room, street, drive, mh01 or kitti01, with commas."),
     _names("methods", "ours, klt-pnp, cuvslam or orbslam3, with commas.", "ours"),
     _RUNS,
     _count("seeds", 3, "Renders of each kind."),

@@ -39,6 +39,21 @@ def zoom_right(share: float, camera: StereoCamera) -> StereoCamera:
     return replace(camera, right=replace(right, fx=right.fx * (1 + share), fy=right.fy * (1 + share)))
 
 
+def zoom_left(share: float, camera: StereoCamera) -> StereoCamera:
+    """The left focal length is given too long."""
+    left = camera.left
+    return replace(camera, left=replace(left, fx=left.fx * (1 + share), fy=left.fy * (1 + share)))
+
+
+def mix(seed: int, camera: StereoCamera) -> StereoCamera:
+    """Some of all that may be wrong with the right eye at once: each with a chance of two fifths, normal."""
+    rng = np.random.default_rng(seed)
+    chosen, sizes = rng.random(6) < 0.4, rng.normal(size=6) * [4.0, 3.0, 0.4, 0.5, 0.4, 0.01]
+    columns, rows, *degrees, share = np.where(chosen, sizes, 0.0).tolist()
+    turned = turn_right((degrees[0], degrees[1], degrees[2]), camera)
+    return zoom_right(share, lower_centre(rows, move_centre(columns, turned)))
+
+
 def stretch_baseline(share: float, camera: StereoCamera) -> StereoCamera:
     """The baseline is given too long."""
     T_left_right = camera.T_left_right.copy()
@@ -91,6 +106,8 @@ CALIBRATION_FAULTS: dict[str, Fault] = {
         zoom_right,
         {"0.2": 0.002, "0.5": 0.005, "1": 0.01, "2": 0.02},
     ),
+    **_sizes("left_zoom", "focal length of the left eye {} % too long", zoom_left, {"2": 0.02}),
+    **_sizes("mixture", "drawn mixture {} of cx, cy, pitch, yaw, roll, zoom", mix, {f"{k}": k for k in range(1, 9)}),
     **_sizes("baseline", "baseline {} % too long", stretch_baseline, {"0.5": 0.005, "1": 0.01, "2": 0.02}),
     **_sizes("k1", "k1 of the right lens {} too large", bend_right, {"0.005": 0.005, "0.01": 0.01, "0.02": 0.02}),
     **{

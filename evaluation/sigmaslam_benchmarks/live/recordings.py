@@ -32,6 +32,7 @@ RENDERED = {"room": (360, 270), "street": (576, 176)}
 REAL = {
     "drive": ("kitti_raw_0926_0039_a", "poses.txt", (0.21, 0.05)),
     "mh01": ("euroc_mh01_f000_099", "groundtruth.tum", (0.002, 0.2)),
+    "kitti01": ("kitti_odometry_01_f000_050", "poses.txt", (0.21, 0.05)),
 }
 """Folder, its truth, and the sigmas of this: metres and degrees."""
 SEQUENCES = (*RENDERED, *REAL)
