@@ -202,9 +202,7 @@ def _judge_mounting(
     return Finding(_MOUNTING, "error" if np.radians(angle) > _NEAR else "warning", message, angle)
 
 
-def _judge_place(
-    times: np.ndarray, poses: np.ndarray, recording: InertialRecording, mounting: Finding
-) -> Finding:
+def _judge_place(times: np.ndarray, poses: np.ndarray, recording: InertialRecording, mounting: Finding) -> Finding:
     """Of the whole T_cam_imu, whose rotation is right, by the forces along the path."""
     # How well poses are known is estimated.
     path = CameraPath(times, poses, np.tile(1e-6 * np.eye(6), (len(times), 1, 1)), np.zeros((len(times), 6, 0)))
@@ -215,10 +213,9 @@ def _judge_place(
     place, covariance = found.sensor.T_left_imu[:3, 3], found.covariance[4:, 4:]
     change = place - recording.sensor.T_left_imu[:3, 3]
     size, sigma = 1e3 * np.linalg.norm(change), 1e3 * np.sqrt(np.linalg.eigvalsh(covariance)[-1])
-    figure = f"{size:.0f} ± {sigma:.0f} mm"
+    figure, where = f"{size:.0f} ± {sigma:.0f} mm", ", ".join(f"{each:.3f}" for each in place)
     if float(change @ np.linalg.solve(covariance + _LEVER**2 * np.eye(3), change)) < _CHI_SQUARE:
         return replace(mounting, message=f"{mounting.message}, the sensor's place {figure}")
-    where = ", ".join(f"{each:.3f}" for each in place)
     message = f"the sensor seems to be {figure} beside its place there, at ({where}) m: calibrate with --imu"
     return Finding(_MOUNTING, "warning", message, size)
 

@@ -74,10 +74,11 @@ def check_rig(
     if findings[1].severity == "error":
         return findings + unknown_rig("the matches do not follow the calibrated rig", _NAMES[3:]), rectifier.camera
     findings.append(_check_synchronisation(level.fit, frame_interval))
-    if findings[-1].severity not in ("ok", "unknown"):
-        return findings + unknown_rig("the eyes are not synchronised", _NAMES[4:]), level.rectifier.camera
     camera, view = level.rectifier.camera, level.rectifier.rectified
     rows = _check_rows(given, level, rectifier.rectified.fx)
+    if findings[-1].severity not in ("ok", "unknown"):
+        others = unknown_rig("the eyes are not synchronised", _NAMES[4:])
+        return [*findings, *(rows if level.causes else others[:3]), *others[3:]], camera
     infinity = _check_infinity(level.fit)
     if level.fit.most("roll", "yaw") > WARN_ROWS and infinity.severity != "error":
         infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")

@@ -91,7 +91,7 @@ def test_an_enlarged_right_image_is_no_turn():
 
 @pytest.mark.long
 def test_lenses_that_bend_rows_hide_no_fault_of_a_highway_camera(real_data):
-    """KITTI 01: rows bent as by half a degree of yaw, and a road whose rows go with y^2, as a pitch's and a delay's do."""
+    """KITTI 01: rows bent as by half a degree of yaw; those of its road go with y^2, as a pitch's and a delay's do."""
     sequence = open_sequence(real_data / "kitti_odometry_01_f000_050").select(Selection(count=17))
     given = sequence.camera
     turn = rigid_motion(cv2.Rodrigues(np.radians((0.45, 0.0, 0.0)))[0], np.zeros(3))

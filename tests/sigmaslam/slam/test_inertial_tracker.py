@@ -16,6 +16,7 @@ from sigmaslam.slam.tracker import Estimate, StereoTracker
 from tests.support.inertial import SENSOR
 from tests.support.simulated_stereo import parallel_camera
 
+
 def true_poses(path: Path) -> np.ndarray:
     table = np.loadtxt(path)
     T = np.tile(np.eye(4), (len(table), 1, 1))
