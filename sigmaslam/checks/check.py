@@ -11,7 +11,6 @@ from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
 from sigmaslam.checks.finding import Finding, has_errors, wrong
 from sigmaslam.checks.images import check_images, check_light, check_overlay, describe_frames, light_ratio
 from sigmaslam.checks.inertial import check_inertial, check_times
-from sigmaslam.checks.inertial_agreement import check_motion
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
 from sigmaslam.checks.time_stamps import check_time_stamps
@@ -95,6 +94,8 @@ def check_sequence(
             rig, camera = _check_rig(matches, steps, matcher, interval, {each.name for each in wrong(calibration)})
             findings += rig
             if track_imu and sequence.imu is not None:
+                from sigmaslam.checks.inertial_agreement import check_motion  # loads what calibrates
+
                 findings += check_motion(sequence, camera, threads)
     rectified = [rectifier.rectify(frame.left, frame.right) for frame, _ in steps]
     return Check(findings, steps, rectified, matches, camera)
