@@ -36,8 +36,8 @@ _FIRST_SCALE, _CONVERGED = 25.0, 1e-6
 # So many rounds integrate the samples anew; after them biases and delay hardly move, and the first order will do.
 _INTEGRATED = 3
 # Turns that are off by more are in another unit (focal lengths of few views are off by a tenth); those of which less is
-# explained are of another motion.
-_SCALE_TOLERANCE, _EXPLAINED = 0.3, 0.7
+# explained are of another motion. Forces, m/s^2/sqrt(Hz), have 0.13 of a wrong sign or axis, MH_01's 0.003 to 0.03.
+_SCALE_TOLERANCE, _EXPLAINED, _FOREIGN_FORCE = 0.3, 0.7, 0.1
 # Images: fewer say nothing; they lie no further apart than that, seconds.
 _FEWEST, _LONGEST = 20, 2.0
 # Power spectra of accelerations that nobody measured, across gaps, m^2/s^3 and rad^2/s^3: those of a hand.
@@ -67,6 +67,11 @@ class ImuCalibration:
     gravity_sigma: float
     scales: np.ndarray
     images: int
+
+    @property
+    def is_foreign(self) -> bool:
+        """Forces hardly follow the motion."""
+        return bool((self.scales[2] - 1.0) * self.sensor.accel_density > _FOREIGN_FORCE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,6 @@ from sigmaslam.geometry.camera import CameraModel
 from sigmaslam.geometry.se3 import rotation_log, se3_inverse
 from sigmaslam.readers.pairing import stamps_of
 
-# Noise of forces, m/s^2/sqrt(Hz), above their density: 0.13 with a wrong sign or axis, MH_01's 0.003 to 0.03.
-_FOREIGN_FORCE = 0.1
-
 
 def image_times(names: Sequence[str]) -> np.ndarray:
     """(N,) seconds of images that are named by their time since 1970, as those of `board_images` of both eyes.
@@ -68,7 +65,6 @@ def describe_imu_calibration(result: ImuCalibration) -> str:
     sigmas, bias_sigmas = (np.sqrt(np.diag(each)) for each in (result.covariance, result.bias_covariance))
     T = result.sensor.T_left_imu
     poses, gyro, accel = result.scales
-    is_foreign = (accel - 1.0) * result.sensor.accel_density > _FOREIGN_FORCE
     doubt = "\nforces    hardly follow the motion: are they in m/s^2, 9.81 upwards at rest, in the gyro's axes?"
     return "\n".join(
         [
@@ -80,7 +76,7 @@ def describe_imu_calibration(result: ImuCalibration) -> str:
             f"{_listed(result.biases[3:], bias_sigmas[3:], 4)} m/s^2, at the end",
             f"gravity   is known to {np.degrees(result.gravity_sigma):.2f} degrees",
             f"noise     gyro {gyro:.1f} and accelerometer {accel:.1f} times their densities, poses {poses:.2f} times "
-            f"as was said{doubt if is_foreign else ''}",
+            f"as was said{doubt if result.is_foreign else ''}",
         ]
     )
 

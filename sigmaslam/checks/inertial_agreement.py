@@ -34,6 +34,8 @@ _CHI_SQUARE = 14.16
 _WINDOW, _INTERVAL = 2.0, 0.15
 # Place, speed and gravity are fitted to fewer than half of that many.
 _LEAST_POSES = 8
+# Metres: a place of the sensor that is known no better is not told.
+_VAGUE = 0.1
 # Frames that are tracked for the check, 5 s at 20 Hz: of MH_01's 50 show the sensor's place to 15 mm, these to 10.
 _FRAMES = 100
 
@@ -95,7 +97,8 @@ def judge_motion(
         axes, of_forces = np.eye(3), np.eye(3) if _same(of_forces, axes) else of_forces
     gyro, forces = _judge_gyro(fit, np.eye(3) if axes is None else axes), _judge_forces(of_forces)
     if gyro.severity == forces.severity == mounting.severity == "ok":
-        mounting = _judge_place(times[tracked], poses[tracked], recording, mounting)
+        part = _longest_part(times, tracked, recording, sensor.time_shift + fit.delay)
+        mounting = _judge_place(times[part], poses[part], recording, mounting)
     return [gyro, forces, mounting, _judge_clock(fit, sensor.time_shift)]
 
 
@@ -125,26 +128,32 @@ def _axes_of_forces(
     times: np.ndarray, bodies: np.ndarray, tracked: np.ndarray, recording: InertialRecording, shift: float
 ) -> np.ndarray | None:
     """The signed axes (3, 3) that the accelerometer has instead of the expected ones; None where it does not show."""
-    samples = recording.samples
-    usable = tracked & (times + shift > samples.timestamp[0]) & (times + shift < samples.timestamp[-1])
-    breaks = np.flatnonzero(np.r_[True, (np.diff(times) > _INTERVAL) | ~usable[1:] | ~usable[:-1], True])
-    longest = int(np.argmax(np.diff(breaks)))
-    first, last = int(breaks[longest]), int(breaks[longest + 1]) - 1
     if not recording.sensor.has_accelerometer:
         return None
-    if times[last] - times[first] < 0.5 * _WINDOW or last - first < _LEAST_POSES:
+    part = _longest_part(times, tracked, recording, shift)
+    times, bodies = times[part], bodies[part]
+    if times[-1] - times[0] < 0.5 * _WINDOW or len(times) <= _LEAST_POSES:
         return None
     # The part of it with the longest way.
-    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(bodies[first : last + 1, :3, 3], axis=0), axis=1))]
-    ends = np.searchsorted(times[first : last + 1], times[first : last + 1] + _WINDOW, "right") - 1
+    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1))]
+    ends = np.searchsorted(times, times + _WINDOW, "right") - 1
     start = int(np.argmax(way[ends] - way))
-    chosen = slice(first + start, first + int(ends[start]) + 1)
-    misses = fit_axes(times[chosen], bodies[chosen], samples, shift)
+    chosen = slice(start, int(ends[start]) + 1)
+    misses = fit_axes(times[chosen], bodies[chosen], recording.samples, shift)
     best = int(np.argmin(misses))
     if misses[0] <= _BETTER * misses[best]:
         # Of a path without accelerations all axes are as good.
         return np.eye(3) if np.median(misses) > _BETTER * misses[0] else None
     return np.asarray(SIGNED_AXES[best].T)
+
+
+def _longest_part(times: np.ndarray, tracked: np.ndarray, recording: InertialRecording, shift: float) -> slice:
+    """The most successive images with a pose, and samples, none far from the next."""
+    usable = tracked & (times + shift > recording.samples.timestamp[0])
+    usable &= times + shift < recording.samples.timestamp[-1]
+    breaks = np.flatnonzero(np.r_[True, (np.diff(times) > _INTERVAL) | ~usable[1:] | ~usable[:-1], True])
+    longest = int(np.argmax(np.diff(breaks)))
+    return slice(int(breaks[longest]), int(breaks[longest + 1]))
 
 
 def _judge_gyro(fit: TurnFit, axes: np.ndarray) -> Finding:
@@ -212,8 +221,10 @@ def _judge_place(times: np.ndarray, poses: np.ndarray, recording: InertialRecord
         return mounting
     place, covariance = found.sensor.T_left_imu[:3, 3], found.covariance[4:, 4:]
     change = place - recording.sensor.T_left_imu[:3, 3]
-    size, sigma = 1e3 * np.linalg.norm(change), 1e3 * np.sqrt(np.linalg.eigvalsh(covariance)[-1])
-    figure, where = f"{size:.0f} ± {sigma:.0f} mm", ", ".join(f"{each:.3f}" for each in place)
+    size, sigma = float(np.linalg.norm(change)), float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    if found.is_foreign or sigma > _VAGUE:
+        return mounting
+    figure, where = f"{1e3 * size:.0f} ± {1e3 * sigma:.0f} mm", ", ".join(f"{each:.3f}" for each in place)
     if float(change @ np.linalg.solve(covariance + _LEVER**2 * np.eye(3), change)) < _CHI_SQUARE:
         return replace(mounting, message=f"{mounting.message}, the sensor's place {figure}")
     message = f"the sensor seems to be {figure} beside its place there, at ({where}) m: calibrate with --imu"

@@ -1,13 +1,13 @@
 """The right camera as the matches have it: turned, moved or enlarged until both eyes see a place in the same row."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.hypotheses import rectified_places, stored_places
-from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, curvature, fit_rows
+from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows, misfit
 from sigmaslam.errors import CalibrationError
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.geometry.camera import StereoCamera
@@ -32,13 +32,13 @@ class LevelledEyes:
         rectifier: of the corrected pair.
         matches: in its images.
         fit: of what is left.
-        causes: of `RowFit.by_cause`, what was corrected; empty where nothing was.
+        causes: of `RowFit.unit`, what was corrected, by how many pixels in all; empty where nothing was.
     """
 
     rectifier: StereoRectifier
     matches: EyeMatches
     fit: RowFit
-    causes: tuple[str, ...] = ()
+    causes: dict[str, float] = field(default_factory=dict)
 
 
 def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
@@ -46,8 +46,8 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
 
     What is significant is corrected beyond four of the standard deviations that the calibration claims, and where it
     moves rows by what is warned of; a yaw from there on alone, as lenses bend rows so, too. Rows that are all lower are
-    those of a pitch or of another principal point, whichever leaves them less curved; another size is that of fy alone
-    where this makes pixels as square as the left ones, which rows cannot tell.
+    those of a pitch or of another principal point, whichever leaves less of them; another size is that of fy alone where
+    this makes pixels as square as the left ones, which rows cannot tell.
 
     Args:
         matches: in the images of `rectifier`.
@@ -60,16 +60,17 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
         claimed = {name: max(claimed[name], measured.get(error, 0.0)) for name, error in names}
     claimed["yaw"] = np.inf
     credible = {name: _CREDIBLE * focal * sigma for name, sigma in claimed.items()}
-    given = LevelledEyes(rectifier, matches, fit, _wrong(fit, credible))
+    given, first = LevelledEyes(rectifier, matches, fit), _wrong(fit, credible)
     stored, found, least = stored_places(matches, rectifier), [given], np.median(np.abs(matches.row_difference))
-    for is_turned in (True, False) if "shift" in given.causes else (True,) if given.causes else ():
+    for is_turned in (True, False) if "shift" in first else (True,) if first else ():
         eyes = given
         try:
             for _ in range(_ROUNDS):
                 # What is large may hide others.
-                more = _wrong(eyes.fit, credible)
-                causes = tuple(name for name in credible if name in eyes.causes or name in more)
-                other = StereoRectifier(_corrected(replace(eyes, causes=causes), is_turned))
+                wrong = {*eyes.causes, *_wrong(eyes.fit, credible)}
+                more = {name: getattr(eyes.fit, name) for name in credible if name in wrong}
+                causes = {name: eyes.causes.get(name, 0.0) + size for name, size in more.items()}
+                other = StereoRectifier(_corrected(eyes, more, is_turned))
                 moved = rectified_places(matches, stored, other)
                 if len(moved) < MIN_MATCHES:
                     raise CalibrationError("the corrected eyes see nothing together")
@@ -79,9 +80,12 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
         rows = np.abs(moved.row_difference)
         if float((rows <= WARN_ROWS).mean()) > _LEVEL and np.median(rows) < least:
             found.append(eyes)
-    if len(found) == 1:
-        return replace(given, causes=())
-    return min(found[1:], key=lambda eyes: abs(curvature(eyes.matches, eyes.rectifier.rectified)))
+    best = min(found[1:] or found, key=lambda eyes: misfit(eyes.matches, eyes.rectifier.rectified))
+    right, before = best.rectifier.camera.right, camera.right
+    # If the left eye is the wrong one, the scale is: as likely as not.
+    share = (right.fx / before.fx - 1.0) / np.sqrt(2.0)
+    sigmas = replace(camera.sigmas, focal=float(np.hypot(camera.sigmas.focal, share)))
+    return replace(best, rectifier=StereoRectifier(replace(best.rectifier.camera, sigmas=sigmas))) if share else best
 
 
 def _wrong(fit: RowFit, credible: dict[str, float]) -> tuple[str, ...]:
@@ -94,12 +98,10 @@ def _wrong(fit: RowFit, credible: dict[str, float]) -> tuple[str, ...]:
     )
 
 
-def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:
-    """The camera without what the fit has left of the causes; a shift is that of a turn, or of the principal point."""
+def _corrected(eyes: LevelledEyes, causes: dict[str, float], is_turned: bool) -> StereoCamera:
+    """The camera without causes of so many pixels; a shift is that of a turn, or of the principal point."""
     camera, focal = eyes.rectifier.camera, eyes.rectifier.rectified.fx
-    shift, roll, zoom, yaw = (
-        getattr(eyes.fit, name) / focal * (name in eyes.causes) for name in ("shift", "roll", "zoom", "yaw")
-    )
+    shift, roll, zoom, yaw = (causes.get(name, 0.0) / focal for name in ("shift", "roll", "zoom", "yaw"))
     right, to_right = camera.right, eyes.rectifier.R_rectified_right
     aspect = right.fy / right.fx * camera.left.fx / camera.left.fy - 1.0
     wider = zoom * (abs(aspect) < 0.5 * abs(zoom))
@@ -107,6 +109,4 @@ def _corrected(eyes: LevelledEyes, is_turned: bool) -> StereoCamera:
     right = right if is_turned else replace(right, cy=right.cy + shift * right.fy)
     turn, _ = cv2.Rodrigues(np.array([shift * is_turned, -yaw, -roll]))
     R = camera.T_left_right[:3, :3] @ to_right.T @ turn @ to_right
-    # If the left eye is the wrong one, the scale is: as likely as not.
-    sigmas = replace(camera.sigmas, focal=float(np.hypot(camera.sigmas.focal, wider / np.sqrt(2.0))))
-    return replace(camera, right=right, T_left_right=rigid_motion(R, camera.T_left_right[:3, 3]), sigmas=sigmas)
+    return replace(camera, right=right, T_left_right=rigid_motion(R, camera.T_left_right[:3, 3]))

@@ -16,9 +16,9 @@ from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.argument_checks import MAX_DELAY
 from sigmaslam.two_view.epipolar import estimate_epipolar_pose
 
-# The tracker takes a pair for swapped where more than this share of the disparities is below -1 px: from half of it on
-# cx is moved.
-_MAX_BEHIND, _WARN_BEHIND = 0.1, 0.02
+# The tracker takes a pair for swapped where more than this share of the disparities is below -1 px: cx is moved, from
+# the third share on where the least lie no further below, pixels: wrong matches of a fence have a long tail.
+_MAX_BEHIND, _WARN_BEHIND, _MOVED_BEHIND, _TAIL = 0.1, 0.02, 0.05, 3.0
 # A rig is explained by a hypothesis that this share of the matches follows, if it is so many times the share of
 # those that follow the calibration.
 _EXPLAINED, _BETTER = 0.5, 2.0
@@ -77,8 +77,8 @@ def check_rig(
     camera, view = level.rectifier.camera, level.rectifier.rectified
     rows = _check_rows(given, level, rectifier.rectified.fx)
     if findings[-1].severity not in ("ok", "unknown"):
-        others = unknown_rig("the eyes are not synchronised", _NAMES[4:])
-        return [*findings, *(rows if level.causes else others[:3]), *others[3:]], camera
+        *others, infinity = unknown_rig("the eyes are not synchronised", _NAMES[4:])
+        return [*findings, *(rows if level.causes else others), infinity], camera
     infinity = _check_infinity(level.fit)
     if level.fit.most("roll", "yaw") > WARN_ROWS and infinity.severity != "error":
         infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
@@ -232,6 +232,7 @@ def _when(lag: float) -> str:
 
 def _check_rows(given: RowFit, level: LevelledEyes, focal: float) -> list[Finding]:
     """What moves rows: all alike, as a turn does, or as another size of the image; and whether that is corrected."""
+    given = replace(given, **level.causes)
     roll, yaw = (float(np.degrees(np.arctan(abs(each) / focal))) for each in (given.roll, given.yaw))
     shift = f"right rows are {given.shift:+.2f} px from the left ones"
     turn = f"the right camera is turned by {roll:.2f} degrees about its axis, {yaw:.2f} about the vertical"
@@ -243,7 +244,7 @@ def _check_rows(given: RowFit, level: LevelledEyes, focal: float) -> list[Findin
     )
     findings = []
     for name, causes, what, cure in kinds:
-        most, corrected = given.most(*causes), {*causes} & {*level.causes}
+        most, corrected = given.most(*causes), {*causes} & level.causes.keys()
         pixels = _LENS_ROWS * abs(given.yaw) / given.most("yaw") if "yaw" in corrected else most * (not corrected)
         what = what if name == "rows" else f"{what}: rows move by {most:.2f} px in a tenth of the places"
         severity: Severity = "ok"
@@ -263,7 +264,7 @@ def _check_infinity(fit: RowFit) -> Finding:
         f"{100 * behind:.0f} % of the matches lie behind infinity, with disparities from {lowest:.1f} px: cx of one "
         "eye or the yaw of the right camera is wrong: calibrate again"
     )
-    if behind <= 0.5 * _MAX_BEHIND:
+    if behind <= _MOVED_BEHIND or (behind <= _MAX_BEHIND and lowest < -_TAIL):
         return Finding("infinity", "warning", message, behind)
     return Finding("infinity", "error", f"{message}; until then the least is taken for 0", behind, -lowest)
 

@@ -13,6 +13,8 @@ _ITERATIONS = 20
 _ROBUST, _MIN_SIGMA = 2.0, 0.05
 # Causes count where they are larger than so many standard deviations.
 SIGNIFICANT = 5.0
+# Rigs are compared by residuals up to about this size, pixels: matches err by 0.1 to 0.2.
+_COMPARED = 0.3
 MIN_INLIERS = 15
 """A pose needs so many matches that agree; as in `sigmaslam.TrackerConfig`."""
 MIN_MATCHES = 3 * MIN_INLIERS
@@ -32,7 +34,7 @@ class RowFit:
             image: row differences with x, y, x y.
         lag: frames by which the right images are later than the left ones; NaN where the motion does not show it.
         sigmas: (5,) standard deviations of all these, in this order.
-        by_cause: (M,) what each of shift, roll, yaw and zoom makes of the rows, pixels, by these names.
+        unit: (M,) what a pixel of each of shift, roll, zoom and yaw makes of the rows, by these names.
         by_lag: (M, 2) what the lag makes of the right places, pixels.
         residual: (M,) row differences that are left, pixels.
     """
@@ -44,7 +46,7 @@ class RowFit:
     yaw: float
     lag: float
     sigmas: np.ndarray
-    by_cause: dict[str, np.ndarray]
+    unit: dict[str, np.ndarray]
     by_lag: np.ndarray
     residual: np.ndarray
 
@@ -63,7 +65,7 @@ class RowFit:
 
     def most(self, *causes: str) -> float:
         """Pixels by which causes together move rows in a tenth of the places at least."""
-        return float(np.percentile(np.abs(sum(self.by_cause[name] for name in causes)), 90))
+        return float(np.percentile(np.abs(sum(getattr(self, name) * self.unit[name] for name in causes)), 90))
 
     def agreement(self, tolerance: float) -> float:
         """Share that a parallel pair with these errors has: rows within `tolerance` px, disparity above -0.5 of it."""
@@ -86,20 +88,21 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
             coefficients[4], sigmas[4] = own[0][4], own[1][4]
             coefficients[:4], sigmas[:4] = _fit(columns[:, :4], rows - coefficients[4] * columns[:, 4], chances)
     shift, roll, zoom, yaw, lag = coefficients.tolist()
-    by_cause = dict(zip(("shift", "roll", "zoom", "yaw"), (coefficients * columns).T, strict=False))
+    unit = dict(zip(("shift", "roll", "zoom", "yaw"), columns[:, :4].T, strict=True))
     flow = matches.flow if moving else np.zeros_like(matches.flow)
-    places = by_cause, lag * flow, rows - columns @ coefficients
+    places = unit, lag * flow, rows - columns @ coefficients
     return RowFit(matches, shift, roll, zoom, yaw, lag if moving else np.nan, sigmas, *places)
 
 
-def curvature(matches: EyeMatches, camera: RectifiedStereo) -> float:
-    """Row differences with y^2, pixels: what a turn leaves that was taken for another principal point.
+def misfit(matches: EyeMatches, camera: RectifiedStereo) -> float:
+    """Mean loss, 0 to 1, of row differences that no delay explains.
 
-    A delay is left out: what the road's rows move by ahead of a car goes with y^2, too.
+    A delay would hide a pitch that was taken for another principal point: what it leaves goes with y^2, and so do the
+    rows of a road ahead.
     """
-    columns = _columns(matches, camera, moving=False)
-    columns[:, 4] = columns[:, 2] ** 2
-    return float(_fit(columns, matches.row_difference, matches.probability)[0][4])
+    columns, rows, chances = _columns(matches, camera, False)[:, :4], matches.row_difference, matches.probability
+    squared = ((rows - columns @ _fit(columns, rows, chances)[0]) / _COMPARED) ** 2
+    return float(np.average(squared / (1.0 + squared), weights=chances))
 
 
 def _columns(matches: EyeMatches, camera: RectifiedStereo, moving: bool) -> np.ndarray:

@@ -57,11 +57,16 @@ def stamp_noise(intervals: Sequence[float] | np.ndarray) -> float:
 
 
 def missing_frames(intervals: np.ndarray) -> int:
-    """How many frames of a regular camera are missing between stamps that can be believed, as of `stamp_noise`."""
-    usual = float(np.median(intervals)) if len(intervals) else np.inf
-    if usual > _SLOWEST or stamp_noise(intervals) > 0.0:
+    """How many frames of a regular camera are missing between stamps that can be believed, as of `stamp_noise`.
+
+    Of a long interval those of 20 s at most; none of three or more alike in a row, which are another rate.
+    """
+    usual = float(np.median(intervals)) if len(intervals) and np.isfinite(intervals).all() else np.inf
+    if not 0.0 < usual <= _SLOWEST or stamp_noise(intervals) > 0.0:
         return 0
-    return int(np.sum(np.maximum(np.round(intervals / usual) - 1.0, 0.0)))
+    steps = np.pad(np.minimum(intervals, _LONGEST), 1)
+    is_alone = np.maximum(np.abs(steps[1:-1] - steps[:-2]), np.abs(steps[1:-1] - steps[2:])) > _IRREGULAR * usual
+    return int(np.sum(np.maximum(np.round(steps[1:-1] / usual) - 1.0, 0.0)[is_alone]))
 
 
 class FrameClock:

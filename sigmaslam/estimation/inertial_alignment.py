@@ -20,8 +20,8 @@ _LOGGER = logging.getLogger(__name__)
 
 # Gravity is looked for in the poses of so many seconds, and in no fewer than so many poses.
 _ALIGNED_SECONDS, _ALIGNED_POSES = 1.0, 5
-# Sooner in so many, whose 27 coordinates are more than twice the unknowns.
-_SOON_SECONDS, _SOON_POSES = 0.4, 9
+# Sooner in so many, whose 27 coordinates are more than twice the unknowns; 0.4 s at 20 Hz, but for jitter.
+_SOON_SECONDS, _SOON_POSES = 0.35, 9
 # Poses of a camera that is so slow that fewer fit into the seconds above are kept for so long, seconds.
 _LONGEST = 10.0
 # m/s^2, standard deviation of an accelerometer's bias: data sheets of small sensors say 0.02 to 0.5.

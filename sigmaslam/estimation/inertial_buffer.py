@@ -12,8 +12,8 @@ from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 _FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 3.0
 # So many times the densities' variance is no noise any more but another fault.
 _LARGEST_SCALE = 1e4
-# Seconds before a motion whose samples tell by how much those in a gap may have changed.
-_RECENT = 1.0
+# Seconds before a motion whose samples tell by how much those in a gap may have changed: the tracker keeps no more.
+_RECENT = 0.5
 
 
 class InertialBuffer(SampleBuffer):

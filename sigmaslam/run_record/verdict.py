@@ -95,8 +95,9 @@ def times_verdict(summary: dict[str, Any]) -> str | None:
         summary: of run.json: the noise of stamps, seconds, and how many frames are missing or showed an image again.
     """
     noise, repeated, missing = (summary.get(name, 0) for name in ("stamp_noise", "repeated", "missing"))
+    missing -= summary.get("real_time", {}).get("dropped", 0)
     words = [f"Time {jitter_words(noise)}."] if noise > 0.0 else []
-    if missing:
+    if missing > 0:
         words.append(
             f"By their time stamps {missing} frames are missing, the longest interval is "
             f"{summary['longest_interval']:.2g} s: does the driver drop frames, or was its clock set?"

@@ -98,6 +98,12 @@ def test_a_disparity_offset_shows_where_it_leads_behind_infinity():
     assert found["infinity"] == ("error", pytest.approx((far.disparity < -1.0).mean(), abs=0.02))
 
 
+def test_a_fence_that_is_matched_wrongly_is_not_behind_infinity():
+    far = matches_of(outliers=0.0, count=1500)
+    far.right[::16, 0] = far.left[::16, 0] + np.linspace(5.0, 30.0, len(far.left[::16]))
+    assert findings_of(far)["infinity"][0] == "warning"
+
+
 def test_a_right_camera_turned_outwards_is_not_taken_for_exchanged_eyes():
     found = findings_of(matches_of((0.0, 0.0, 0.0, 60.0)))
     assert found["eyes"][0] == "ok"

@@ -59,6 +59,12 @@ def test_frames_that_are_missing_are_counted(kept: list[int], rate: float, missi
     assert missing_frames(np.diff(np.array(kept) / rate)) == missing
 
 
+def test_another_rate_is_no_row_of_missing_frames():
+    assert missing_frames(np.r_[np.full(60, 1 / 30), np.full(50, 1 / 15)]) <= 2
+    assert missing_frames(np.r_[np.full(60, 1 / 30), 1.7e9, np.full(60, 1 / 30)]) == 599
+    assert missing_frames(np.zeros(5)) == missing_frames(np.array([0.1, np.nan])) == missing_frames(np.zeros(0)) == 0
+
+
 @pytest.mark.parametrize(
     "noise",
     [

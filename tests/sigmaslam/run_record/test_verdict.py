@@ -121,6 +121,9 @@ def test_stamps_that_jitter_and_images_that_repeat_are_said():
     assert "10 frames" in times_verdict({"stamp_noise": 0.0, "repeated": 10})
     said = times_verdict({"missing": 12, "longest_interval": 0.55})
     assert "12 frames are missing, the longest interval is 0.55 s" in said
+    # Those that we dropped ourselves are no fault of the driver.
+    dropped = {"real_time": {"dropped": 12}}
+    assert times_verdict({"missing": 12, "longest_interval": 0.55, **dropped}) is None
 
 
 def test_a_cause_that_evidence_names_is_said_in_place_of_the_offset():
