@@ -46,8 +46,8 @@ def level_eyes(matches: EyeMatches, rectifier: StereoRectifier) -> LevelledEyes:
 
     What is significant is corrected beyond four of the standard deviations that the calibration claims, and where it
     moves rows by what is warned of; a yaw from there on alone, as lenses bend rows so, too. Rows that are all lower are
-    those of a pitch or of another principal point, whichever leaves less of them; another size is that of fy alone where
-    this makes pixels as square as the left ones, which rows cannot tell.
+    those of a pitch or of another principal point, whichever leaves less; another size is that of fy alone where this
+    makes pixels as square as the left ones, which rows cannot tell.
 
     Args:
         matches: in the images of `rectifier`.

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -232,7 +233,8 @@ def _when(lag: float) -> str:
 
 def _check_rows(given: RowFit, level: LevelledEyes, focal: float) -> list[Finding]:
     """What moves rows: all alike, as a turn does, or as another size of the image; and whether that is corrected."""
-    given = replace(given, **level.causes)
+    sizes: dict[str, Any] = {**level.causes}
+    given = replace(given, **sizes)
     roll, yaw = (float(np.degrees(np.arctan(abs(each) / focal))) for each in (given.roll, given.yaw))
     shift = f"right rows are {given.shift:+.2f} px from the left ones"
     turn = f"the right camera is turned by {roll:.2f} degrees about its axis, {yaw:.2f} about the vertical"
