@@ -79,7 +79,9 @@ def check_rig(
     rows = _check_rows(given, level, rectifier.rectified.fx)
     if findings[-1].severity not in ("ok", "unknown"):
         *others, infinity = unknown_rig("the eyes are not synchronised", _NAMES[4:])
-        return [*findings, *(rows if level.causes else others), infinity], camera
+        if level.causes and findings[-1].severity == "warning":
+            return [*findings, *rows, infinity], camera
+        return [*findings, *others, infinity], rectifier.camera
     infinity = _check_infinity(level.fit)
     if level.fit.most("roll", "yaw") > WARN_ROWS and infinity.severity != "error":
         infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
