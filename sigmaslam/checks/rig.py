@@ -83,7 +83,7 @@ def check_rig(
             return [*findings, *rows, infinity], camera
         return [*findings, *others, infinity], rectifier.camera
     infinity = _check_infinity(level.fit)
-    if level.fit.most("roll", "yaw") > WARN_ROWS and infinity.severity != "error":
+    if max(level.fit.most("roll"), level.fit.most("yaw")) > WARN_ROWS and infinity.severity != "error":
         infinity = Finding("infinity", "unknown", "the right camera is turned, which changes disparities, too")
     if infinity.severity == "error" and infinity.pixels is not None and findings[0].severity == "ok":
         right = camera.right
@@ -252,7 +252,8 @@ def _check_rows(given: RowFit, level: LevelledEyes, focal: float) -> list[Findin
         pixels = _LENS_ROWS * abs(given.yaw) / given.most("yaw") if "yaw" in corrected else most * (not corrected)
         what = what if name == "rows" else f"{what}: rows move by {most:.2f} px in a tenth of the places"
         severity: Severity = "ok"
-        if corrected or most > WARN_ROWS:
+        # Lenses bend rows as a yaw: beside a small roll these are no fault yet.
+        if corrected or most > ROW_TOLERANCE or max(given.most(each) for each in causes) > WARN_ROWS:
             severity = "error" if most > ROW_TOLERANCE and not corrected else "warning"
             what = f"{what}: {cure}, or calibrate again" + f"; {_CORRECTED}" * bool(corrected)
         findings.append(Finding(name, severity, what, given.shift if name == "rows" else most, pixels))
