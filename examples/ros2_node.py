@@ -48,6 +48,8 @@ except ImportError as error:
 
 from sigmaslam import Estimate, StereoTracker
 from sigmaslam.calibration_files.calibration import read_calibration
+from sigmaslam.checks.check import PAIRS_BEFORE_TRACKING, check_pairs
+from sigmaslam.checks.finding import wrong
 from sigmaslam.errors import FrameError, InputError
 from sigmaslam.geometry.se3 import (
     matrix_to_quaternion,
@@ -70,6 +72,7 @@ PARAMETERS = {
     "base_frame": "base_link",
     "publish_odom_tf": True,  # false: another node gives odom -> base, such as wheels
     "calibration": "",  # file in place of the CameraInfo, any that `sigmaslam track --calibration` reads
+    "check": True,  # the first pairs, and correct what is wrong with the rows of the right eye
     "mask": "",  # image, black where the left image is not used
     "map": "",  # map.npz of an earlier run with the same camera on the same robot
     "frontend": "learned",
@@ -153,6 +156,7 @@ class SigmaSlamNode(Node):
         self._odometry, self._grey = ContinuousOdometry(), GreyConverter()
         self._first, self._last, self._jumps = 0, 0, False  # nanoseconds
         self._pair: tuple[Image, Image] | None = None
+        self._first_pairs: list[tuple[np.ndarray, np.ndarray, float]] = []
         self._stopped, self._changed = False, threading.Condition()
         self._tf = Buffer()
         self._listener = TransformListener(self._tf, self)
@@ -242,15 +246,15 @@ class SigmaSlamNode(Node):
             message = f"a pair came {late:.3f} s late and is dropped{mend if late > SILENCE else ''}"
             self._diagnose(DiagnosticStatus.WARN, message, left.header.stamp)
             return
-        if self._tracker is None and (missing := self._prepare(left)) is not None:
+        self._first, self._last = self._first or stamp, stamp
+        seconds = (stamp - self._first) / 1e9  # a float does not hold nanoseconds since 1970
+        pair = zip((left, right), self._topics, strict=True)
+        images = [self._grey.convert(image_array(image, topic), topic) for image, topic in pair]
+        if self._tracker is None and (missing := self._prepare(left, (*images, seconds))) is not None:
             self._diagnose(DiagnosticStatus.WARN, f"waiting for {missing}", left.header.stamp)
             return
         assert self._tracker is not None
-        self._first, self._last = self._first or stamp, stamp
-        pair = zip((left, right), self._topics, strict=True)
-        images = [self._grey.convert(image_array(image, topic), topic) for image, topic in pair]
-        # A float does not hold nanoseconds since 1970.
-        estimate = self._tracker.step(*images, (stamp - self._first) / 1e9, self._mask)
+        estimate = self._tracker.step(*images, seconds, self._mask)
         words = [estimate.status, *estimate.doubts]
         if estimate.status in PUBLISHED:
             words += self._publish(estimate, left.header.stamp)
@@ -269,8 +273,8 @@ class SigmaSlamNode(Node):
         level = DiagnosticStatus.ERROR if estimate.status == "lost" else level
         self._diagnose(level, "; ".join(words), left.header.stamp, values)
 
-    def _prepare(self, left: Image) -> str | None:
-        """Makes the tracker; what is missing for it, in words.
+    def _prepare(self, left: Image, pair: tuple[np.ndarray, np.ndarray, float]) -> str | None:
+        """Makes the tracker, once enough pairs are there to check; what is missing for it, in words.
 
         Raises:
             SigmaSlamError: the calibration, the mask or the map cannot be used.
@@ -292,7 +296,16 @@ class SigmaSlamNode(Node):
             self._mask = read_mask(Path(given["mask"]), *size) if given["mask"] else None
         except FrameError as error:  # of no single frame
             raise InputError(str(error)) from None
-        tracker = StereoTracker(camera, given["frontend"], threads=given["threads"])
+        checked = {"camera": camera}
+        if given["check"]:
+            self._first_pairs.append(pair)
+            if (more := PAIRS_BEFORE_TRACKING - len(self._first_pairs)) > 0:
+                return f"{more} more pairs of images, to check the cameras"
+            check = check_pairs(camera, self._first_pairs, given["threads"])
+            self._first_pairs, checked = [], check.tracker_arguments
+            for each in wrong(check.findings):
+                self.get_logger().warning(f"{each.name}: {each.message}")
+        tracker = StereoTracker(**checked, frontend=given["frontend"], threads=given["threads"])
         if given["map"]:
             tracker.load_map(Path(given["map"]))
         tracker.warm_up()

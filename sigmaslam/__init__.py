@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sigmaslam.bodies.object_tracker import ObjectTracker
+    from sigmaslam.checks.check import check_pairs
     from sigmaslam.errors import SigmaSlamError
     from sigmaslam.frontend.image_pair import Matches, match_images
     from sigmaslam.fusion.location_filter import LocationFilter
@@ -25,6 +26,7 @@ else:
         "StereoCamera": "geometry.camera",
         "StereoTracker": "slam.tracker",
         "TrackerConfig": "slam.config",
+        "check_pairs": "checks.check",
         "match_images": "frontend.image_pair",
         "open_sequence": "readers",
     }
@@ -39,4 +41,4 @@ else:
 
 
 __all__ = ["Estimate", "LocationFilter", "Matches", "ObjectTracker", "SigmaSlamError", "StereoCamera"]
-__all__ += ["StereoTracker", "TrackerConfig", "match_images", "open_sequence"]
+__all__ += ["StereoTracker", "TrackerConfig", "check_pairs", "match_images", "open_sequence"]

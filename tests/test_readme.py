@@ -43,6 +43,7 @@ def test_the_python_in_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(tmp_path)
     image = np.random.default_rng(0).integers(0, 255, (480, 752), dtype=np.uint8)
     names: dict[str, object] = {"left": image, "right": image, "timestamp": 0.0}
+    names["pairs"] = [(image, image, 0.0), (image, image, 0.1)]
     for block in blocks:
         exec(compile(block, "README.md", "exec"), names)
     assert names["estimate"].covariance.shape == (6, 6)

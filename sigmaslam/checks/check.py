@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from sigmaslam.checks.calibration import check_calibration
 from sigmaslam.checks.eye_matches import EyeMatcher, EyeMatches
-from sigmaslam.checks.finding import Finding, has_errors, wrong
+from sigmaslam.checks.finding import Finding, has_errors, tracker_arguments, wrong
 from sigmaslam.checks.images import check_images, check_light, check_overlay, describe_frames, light_ratio
 from sigmaslam.checks.inertial import check_inertial, check_times
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
@@ -16,12 +17,15 @@ from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
 from sigmaslam.checks.time_stamps import check_time_stamps
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
-from sigmaslam.readers.stereo_sequence import FrameStep, StereoSequence
+from sigmaslam.readers.images import ListedPairs
+from sigmaslam.readers.stereo_sequence import SAMPLED_EVERY, FrameStep, StereoSequence
 
 SAMPLES = 8
 """Pairs that `sigmaslam check` looks at."""
 SAMPLES_BEFORE_TRACKING = 4
 """Pairs that are looked at before tracking: under two seconds."""
+PAIRS_BEFORE_TRACKING = SAMPLED_EVERY * (SAMPLES_BEFORE_TRACKING - 1) + 2
+"""Pairs in a row that they are taken from."""
 # An image that was turned or mirrored gives so many times the matches once that is undone.
 _BETTER = 3.0
 _INTRINSICS = {"principal point", "focal length"}
@@ -46,6 +50,27 @@ class Check:
     rectified: list[tuple[np.ndarray, np.ndarray]]
     matches: EyeMatches
     camera: StereoCamera
+
+    @property
+    def tracker_arguments(self) -> dict[str, Any]:
+        """Of `StereoTracker`: the camera, and what else of the findings its poses depend on."""
+        return {"camera": self.camera, **tracker_arguments(self.findings)}
+
+
+def check_pairs(camera: StereoCamera, pairs: Sequence[tuple[np.ndarray, np.ndarray, float]], threads: int = 2) -> Check:
+    """Checks the first pairs of a camera, as `sigmaslam track` does, for a tracker without what is wrong with rows.
+
+    Example:
+        tracker = StereoTracker(**check_pairs(camera, pairs).tracker_arguments)
+
+    Args:
+        pairs: left and right (H, W) images as they come from the cameras, and seconds; some `PAIRS_BEFORE_TRACKING`.
+    Raises:
+        CalibrationError: the first images have another size than the calibration.
+        InputError: there is no pair.
+    """
+    listed = ListedPairs(pairs)
+    return check_sequence(StereoSequence(listed, camera, listed.source, "memory"), SAMPLES_BEFORE_TRACKING, threads)
 
 
 def check_sequence(

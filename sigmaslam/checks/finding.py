@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 Severity = Literal["ok", "unknown", "warning", "error"]
 
@@ -39,11 +39,12 @@ _OF_THE_EYES = frozenset({"mirrored", "distortion", "synchronisation", "eyes", "
 _UNKNOWN_PIXELS = 2.0
 
 
-def disparity_error(findings: Sequence[Finding]) -> float | None:
-    """By how many pixels disparities may be off for faults of the eyes that were found; None where none was."""
+def tracker_arguments(findings: Sequence[Finding]) -> dict[str, Any]:
+    """What faults of the eyes that were found make `StereoTracker` know: `disparity_error` and `right_delay`."""
     faults = [each for each in findings if each.severity in ("warning", "error") and each.name in _OF_THE_EYES]
     pixels = [_UNKNOWN_PIXELS if each.pixels is None else each.pixels for each in faults]
-    return max(filter(None, pixels), default=None)
+    delay = sum(each.delay for each in findings)
+    return {"disparity_error": max(filter(None, pixels), default=None), "right_delay": delay}
 
 
 def wrong(findings: Sequence[Finding]) -> list[Finding]:

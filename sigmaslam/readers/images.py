@@ -205,6 +205,19 @@ class PairSource(ABC):
         raise InputError(f"{self.source}: none of the first {tried} pairs can be read; the first: {reason}")
 
 
+class ListedPairs(PairSource):
+    """Pairs in memory: left and right images, and seconds."""
+
+    source = "pairs in memory"
+
+    def __init__(self, pairs: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> None:
+        self.timestamps, self.length, self._pairs = [seconds for _, _, seconds in pairs], len(pairs), pairs
+
+    def __iter__(self) -> Iterator[RawPair]:
+        for index, (left, right, seconds) in enumerate(self._pairs):
+            yield RawPair(index, seconds, left, right, f"left image {index}", f"right image {index}")
+
+
 class ImagePairs(PairSource):
     """Left and right image files with their timestamps, as a source of pairs.
 

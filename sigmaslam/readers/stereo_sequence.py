@@ -25,8 +25,8 @@ from sigmaslam.readers.selection import Selection, select_pairs
 logger = logging.getLogger(__name__)
 
 READ_AHEAD = 4
-# Of a sequence that is read in order, one of so many frames is sampled.
-_SAMPLED_EVERY = 5
+SAMPLED_EVERY = 5
+"""Of a sequence that is read in order, one of so many frames is sampled."""
 
 T = TypeVar("T")
 
@@ -185,7 +185,7 @@ class StereoSequence:
             wanted = sorted({first + k for first in firsts for k in (0, 1) if first + k < len(pairs.files)})
             items: Iterator[RawPair | SkippedFrame] = (pairs.read(index) for index in wanted)
         else:
-            firsts = [_SAMPLED_EVERY * k for k in range(count)]
+            firsts = [SAMPLED_EVERY * k for k in range(count)]
             items = islice(iter(pairs), firsts[-1] + 2)
         with closing(self._convert(items)) as converted:
             frames = {item.index: item for item in converted if isinstance(item, StereoFrame)}

@@ -16,7 +16,7 @@ from sigmaslam.bodies.object_region import read_region
 from sigmaslam.bodies.object_tracker import OBJECT_CONFIG, ObjectEstimate, ObjectTracker
 from sigmaslam.calibration.learned_calibration import learned_calibration
 from sigmaslam.calibration_files.calibration_writer import write_calibration
-from sigmaslam.checks.finding import Finding, disparity_error, wrong
+from sigmaslam.checks.finding import Finding, tracker_arguments, wrong
 from sigmaslam.checks.images import check_light, light_ratio
 from sigmaslam.checks.inertial_agreement import judge_motion
 from sigmaslam.errors import InputError, OutputError, SigmaSlamError
@@ -186,10 +186,7 @@ def _build_tracker(
         return ObjectTracker(camera, region, **common)
     imu = None if sequence.imu is None else sequence.imu.sensor
     odometry = None if sequence.odometry is None else sequence.odometry.sensor
-    pixels, delay = disparity_error(findings), sum(each.delay for each in findings)
-    return StereoTracker(
-        camera, start=start, disparity_error=pixels, imu=imu, odometry=odometry, right_delay=delay, **common
-    )
+    return StereoTracker(camera, start=start, imu=imu, odometry=odometry, **tracker_arguments(findings), **common)
 
 
 def _describe_location(location: LocationFilter | None) -> dict[str, Any]:

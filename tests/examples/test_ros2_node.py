@@ -52,7 +52,7 @@ def start(example: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
     monkeypatch.setattr(StubBuffer, "transforms", {("base_link", "left_optical"): transform(T_BASE_CAMERA)})
 
     def start(**given: Any) -> Any:
-        monkeypatch.setattr(StubNode, "given", {"threads": 1, "frontend": "klt", **given})
+        monkeypatch.setattr(StubNode, "given", {"threads": 1, "frontend": "klt", "check": False, **given})
         nodes.append(example.SigmaSlamNode())
         return nodes[-1]
 
@@ -356,6 +356,26 @@ def test_what_is_missing_is_said_and_waited_for(start: Callable[..., Any], demo:
     assert "waiting for camera_info on right/camera_info, or" in words[1]
     assert "waiting for the transform from base_link to the camera, left_optical" in words[2]
     assert words[3:] == ["starting", "tracking"]
+
+
+@pytest.mark.long
+def test_the_first_pairs_correct_the_rows_of_a_turned_camera(start: Callable[..., Any], demo_sequence: Path):
+    sequence = open_sequence(demo_sequence)
+    frames = [frame for frame, _ in zip(sequence.frames(), range(19), strict=False)]
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.radians((1.0, 0.0, 0.0)))[0]
+    sequence.camera = replace(sequence.camera, T_left_right=sequence.camera.T_left_right @ turn)
+    statuses = []
+    for check in (False, True):
+        node = start(check=check)
+        tell_calibration(node, sequence)
+        track(node, frames)
+        statuses.append([words.split(";")[0] for _, words in said(node)])
+    assert statuses[0] == ["starting"] * 19  # rows are 5 px off
+    assert statuses[1][0] == "waiting for 16 more pairs of images, to check the cameras"
+    assert statuses[1][16:] == ["starting", "tracking", "tracking"]
+    assert node.logged[0].startswith("rows: ")
+    assert "corrected" in node.logged[0]
 
 
 def test_what_cannot_be_used_ends_the_node_with_a_reason(start: Callable[..., Any], demo: Any, tmp_path: Path):

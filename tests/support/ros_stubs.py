@@ -93,7 +93,7 @@ class StubNode:
         return topic if only_expand else self.remapped.get(topic, topic)
 
     def get_logger(self) -> Any:
-        return SimpleNamespace(fatal=self.logged.append)
+        return SimpleNamespace(fatal=self.logged.append, warning=self.logged.append)
 
     def get_clock(self) -> Any:
         return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=message_class("builtin_interfaces/msg/Time")))

@@ -20,7 +20,7 @@ from sigmaslam.cli.run_summary import tell_summary
 from sigmaslam.errors import SigmaSlamError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam.readers.images import PairSource, RawPair
+from sigmaslam.readers.images import ListedPairs
 from sigmaslam.readers.inertial import InertialRecording
 from sigmaslam.runs.request import InputOptions, LiveOptions, OutputOptions, TrackerOptions, TrackRequest
 from sigmaslam.runs.track import track_sequence
@@ -51,20 +51,6 @@ Method = Callable[[Sequence[DrivenFrame], StereoCamera, Path], DrivenRun]
 """Tracks frames; a run folder may be written to the path, which does not exist."""
 
 
-class DrivenPairs(PairSource):
-    """Delivered frames as a source of pairs."""
-
-    def __init__(self, frames: Sequence[DrivenFrame]) -> None:
-        self.timestamps = [frame.timestamp for frame in frames]
-        self.length = len(frames)
-        self.source = "driver"
-        self._frames = frames
-
-    def __iter__(self) -> Iterator[RawPair]:
-        for index, frame in enumerate(self._frames):
-            yield RawPair(index, frame.timestamp, frame.left, frame.right, "left image", "right image")
-
-
 class DrivenSequence(StereoSequence):
     """Delivered frames as a sequence that remembers which of them was read last.
 
@@ -73,7 +59,8 @@ class DrivenSequence(StereoSequence):
     """
 
     def __init__(self, frames: Sequence[DrivenFrame], camera: StereoCamera) -> None:
-        super().__init__(DrivenPairs(frames), camera, "driver", "memory")
+        pairs = [(each.left, each.right, each.timestamp) for each in frames]
+        super().__init__(ListedPairs(pairs), camera, "driver", "memory")
         self.latest = -1
 
     def frames(self) -> Iterator[StereoFrame]:  # type: ignore[override]
