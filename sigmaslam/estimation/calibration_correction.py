@@ -6,13 +6,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, TURNS
-from sigmaslam.estimation.calibration_evidence import HYPOTHESES, CalibrationEvidence
+from sigmaslam.estimation.calibration_evidence import HOPELESS, HYPOTHESES, CalibrationEvidence
+from sigmaslam.estimation.frame_fit import FrameFit
+from sigmaslam.estimation.state_layout import CALIBRATION_SIZE
+from sigmaslam.geometry.se3 import se3_exp
 
 if TYPE_CHECKING:
     from sigmaslam.estimation.keyframe_window import KeyframeWindow
 
 # An error of the calibration beyond so many standard deviations of its prior is none that calibrations usually have.
 _CREDIBLE = 4.0
+# A frame speaks for itself where its variance is so much smaller than the window's: half of the standard deviation. One
+# that departs by more than so many of the window's sigmas contradicts it: one in eight is, of two too few frames.
+_FAR_BETTER, _CONTRADICTS = 0.25, 1.5
 # Boards are held within arm's reach: there depths are right, whatever else a calibration has wrong, metres.
 _REACH = 0.5
 _BASELINE = np.array([ERRORS.index("baseline")])
@@ -35,6 +41,27 @@ def change_rig(window: "KeyframeWindow", offset: float) -> None:
     window.prior = window.posterior = state
     window.calibration = turned
     window.evidence = CalibrationEvidence(turned, window.camera.fx, window.graphs.condition, window.expected)
+
+
+def foresee(window: "KeyframeWindow", fit: FrameFit, step: np.ndarray, step_covariance: np.ndarray) -> bool:
+    """Whether a frame, which knows the offset far better than the window, has another one, or is sure of what is wrong.
+
+    What it finds are causes that are foreseen.
+
+    Args:
+        step, step_covariance: as of `KeyframeWindow.add_keyframe`.
+    """
+    window.foreseen = {}
+    known, joint = window.posterior, fit.joint
+    departure, variance = fit.calibration[0] - known.calibration[0], known.covariance[0, 0]
+    if joint.covariance[0, 0] > _FAR_BETTER * variance:
+        return False
+    poses = se3_exp(joint.step[CALIBRATION_SIZE:-6].reshape(-1, 6)) @ known.poses
+    about = replace(known, calibration=fit.calibration, poses=np.concatenate([poses, fit.pose[None]]))
+    causes = window.evidence.weigh_frame(about, step, step_covariance, joint.information, joint.score)
+    window.foreseen = {name: cause for name, cause in causes.items() if name not in window.causes}
+    is_sure = any(cause.probability > 1.0 - HOPELESS for cause in window.foreseen.values())
+    return is_sure or bool(departure**2 > _CONTRADICTS**2 * variance)
 
 
 def judge_calibration(window: "KeyframeWindow") -> None:
@@ -60,7 +87,7 @@ def _correct_calibration(window: "KeyframeWindow") -> None:
     One error alone would stand for others, too. The disparity offset is estimated anyway; it is expected where a yaw
     has it.
     """
-    window.causes = window.evidence.weigh()
+    window.causes, window.foreseen = window.evidence.weigh(), {}
     window.expected = window.evidence.expected.copy()
     means, window.worse = window.evidence.beside(window.causes)
     spreads = np.zeros(len(ERRORS))

@@ -29,7 +29,7 @@ from sigmaslam.estimation.window_state import WindowState
 from sigmaslam.inference.onnx_graph import Step
 
 # Of a hundred rigs one has this wrong. Below one in twenty a hypothesis is hopeless, and changes nothing.
-_PRIOR, _HOPELESS = 0.01, 0.05
+_PRIOR, HOPELESS = 0.01, 0.05
 # How large an error is that no calibration usually has, as a share of the focal length: half a degree, a per cent.
 _SIZE = 0.01
 # A file may claim that a calibration has no errors at all, as a share of the focal length.
@@ -131,10 +131,29 @@ class CalibrationEvidence:
         mean, _, precision = self._in_usual_sigmas(state)
         return (precision - np.eye(len(ERRORS))) / _ALIKE, precision @ mean / _ALIKE
 
-    def weigh(self) -> dict[str, Cause]:
+    def weigh_frame(
+        self,
+        about: WindowState,
+        step: np.ndarray,
+        step_covariance: np.ndarray,
+        information: np.ndarray,
+        slope: np.ndarray,
+    ) -> dict[str, Cause]:
+        """`weigh` with what a frame's views say, of which nothing is kept.
+
+        Args:
+            about: window and frame, about which the views say so.
+            step, step_covariance: of the frame from the last keyframe, as of `add_keyframe`.
+            information, slope: (n, n) of the views, (n,) of their log-likelihood there.
+        """
+        known = self._posterior
+        prior = known.grow(known.poses[-1] @ step, step_covariance, np.zeros(len(ERRORS)))
+        return self.weigh(prior.given(information, slope + information @ about.minus(prior), self._condition))
+
+    def weigh(self, state: WindowState | None = None) -> dict[str, Cause]:
         """What may be wrong, by its name, unless it is hopeless; "nothing" has the rest of the probability."""
         usual, sigma = np.eye(len(ERRORS)), self._sigma
-        mean, covariance, precision = self._in_usual_sigmas(self._posterior)
+        mean, covariance, precision = self._in_usual_sigmas(state or self._posterior)
         found: dict[str, tuple[float, float, float]] = {}
         for name in HYPOTHESES:
             spread = self._spreads[name]
@@ -147,7 +166,7 @@ class CalibrationEvidence:
         top = max(0.0, *(ratio for ratio, _, _ in found.values()))
         weights = {name: _PRIOR * np.exp(ratio - top) for name, (ratio, _, _) in found.items()}
         total = (1.0 - _PRIOR * len(found)) * np.exp(-top) + sum(weights.values())
-        return {k: Cause(odds / total, *found[k][1:]) for k, odds in weights.items() if odds > _HOPELESS * total}
+        return {k: Cause(odds / total, *found[k][1:]) for k, odds in weights.items() if odds > HOPELESS * total}
 
     def is_gross(self, causes: dict[str, Cause]) -> bool:
         """Whether one is likely that no calibration usually has: what it does is no longer linear."""

@@ -57,6 +57,7 @@ class KeyframeWindow:
             else than an offset is found to be wrong.
         evidence: weighs what may be wrong.
         causes: of that, what is not hopeless, by its name.
+        foreseen: likewise by the last frame, which knows more.
         corrected: (2, 15) what considered errors are taken to be, and their standard deviations beside the usual ones.
         held_offset: what the disparity offset is taken to be in poses that are published.
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.
@@ -80,6 +81,7 @@ class KeyframeWindow:
         self.calibration = calibration
         self.evidence = CalibrationEvidence(usual or calibration, camera.fx, graphs.condition)
         self.causes: dict[str, Cause] = {}
+        self.foreseen: dict[str, Cause] = {}
         self.corrected = np.zeros((2, CALIBRATION_SIZE))
         self.expected, self.exceeded = np.zeros(CALIBRATION_SIZE), np.zeros(CALIBRATION_SIZE, bool)
         self.held_offset = HeldOffset()

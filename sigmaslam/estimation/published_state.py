@@ -41,6 +41,10 @@ def published_fit(window: KeyframeWindow, fit: FrameFit) -> FrameFit:
     # Errors that the frame's own views share are in `fit.inflation`: once is enough.
     twice = min(factor, fit.inflation) - 1.0
     covariance = fit.covariance + published.covariance[-6:, -6:] - joint.covariance[-6:, -6:] - twice * joint.relative
+    for name, cause in window.foreseen.items():
+        k = ERRORS.index(name)
+        by_error = joint.common[-6:] @ np.linalg.pinv(window.calibration.considered_factor)[:, k]
+        covariance = covariance + cause.probability * (cause.variance + cause.mean**2) * np.outer(by_error, by_error)
     return replace(fit, covariance=covariance, joint=published)
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sigmaslam.estimation.acceptance import ACCEPTANCE
+from sigmaslam.estimation.calibration_correction import foresee
 from sigmaslam.estimation.constant_velocity import MotionFilter, dead_reckoning
 from sigmaslam.estimation.frame_fit import FrameFit
 from sigmaslam.estimation.keyframe_window import KeyframeWindow
@@ -116,7 +117,9 @@ class Mapper:
             doubts: in the pose, which something that moves may have drawn.
         """
         share = fit.count / max(self._landmarks_in_keyframe, 1)
-        if share >= self.config.keyframe_ratio:
+        step, covariance = expected
+        moved = turn_covariance(self.window.posterior.poses[-1], covariance)
+        if share >= self.config.keyframe_ratio and not foresee(self.window, fit, step, moved):
             return None
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
@@ -139,7 +142,6 @@ class Mapper:
         views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / shared)
         if matches.after_gap:
             self.window.landmarks.misses[:] = self.config.max_misses
-        step, covariance = expected
         if self.motion.is_inertial:
             # Its velocity is that of the images, and off alike in all steps of a window: together they know one way.
             shared = np.sqrt(np.repeat([self.config.window, 1.0], 3))

@@ -58,7 +58,9 @@ class Reporter:
         state = published_state(self.window)
         if not len(state):
             return self._report_nothing(timestamp, status, milliseconds)
-        if fit is not None:
+        # What the first two keyframes find to be wrong, no frame before knew.
+        has_learned = tracks is not None and len(state) == 2 and bool(self.window.causes)
+        if fit is not None and not has_learned:
             # Published alone: a prediction as wide as that would find nothing.
             fit = published_fit(self.window, fit).spread_by(doubts.spread)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
@@ -68,7 +70,7 @@ class Reporter:
             prediction = Prediction.of(self.window, self.motion)
             covariance, part = state.covariance, pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance
-            absolute, by_error = covariance[part, part] + relative, state.common[part]
+            absolute, by_error = covariance[part, part] + relative + doubts.spread, state.common[part]
             offset = float(state.calibration[0])
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)
         absolute = absolute + shift

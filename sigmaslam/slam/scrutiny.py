@@ -84,10 +84,7 @@ class Scrutiny:
             matches, fit = self._leave_out(matches, second, moving)
             doubts.add_motion(drawn, fit.pose)
             second = find_second_motion(self._window, matches, fit, moving)
-        if self._input_is_wrong or self._window.evidence.is_gross(self._window.causes):
-            doubts.add(Doubt.INPUT)
-        for index in np.flatnonzero(self._window.exceeded).tolist():
-            doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
+        self.doubt_rig(doubts, fit)
         seen = matches.views.select(fit.inliers)
         ids, follows = self._window.landmarks.id[seen.landmark], self._localiser.follower.is_ready
         if self.timing.are_apart(frame, fit.pose, ids, seen.measurement, follows):
@@ -118,6 +115,15 @@ class Scrutiny:
             fit = self._localiser.fit_again(matches, fit, Prediction.of(self._window, self._motion))
         self._pose = fit.pose
         return matches, fit, doubts
+
+    def doubt_rig(self, doubts: Doubts, fit: FrameFit) -> str:
+        """The status of a pose, with what the window, which may just have learned from it, knows to be wrong."""
+        if self._input_is_wrong or self._window.evidence.is_gross(self._window.causes):
+            doubts.add(Doubt.INPUT)
+        if Doubt.OFFSET not in doubts.reasons:
+            for index in np.flatnonzero(self._window.exceeded).tolist():
+                doubts.add(Doubt.OFFSET, _without_error(self._window, fit, index))
+        return doubts.status
 
     def miss(self, timestamp: float, shows: bool) -> None:
         """An image without a pose says nothing against a sensor's prediction; if it `shows` a place, nor for a stop."""

@@ -112,7 +112,6 @@ class StereoTracker:
             load = ThreadPoolExecutor(1, "loading").submit(load).result
         self.rectifier = StereoRectifier(camera)
         self._camera, turned = (rectified := self.rectifier.rectified), self.rectifier.T_rectified_left
-        self._blas = ThreadpoolController()
         self._admission = admission = admission or AdmitAll(config.min_inliers, config.spacing)
         graphs = EstimatorGraphs(rectified, backend, config.linearisation == "unscented")
         prior = CalibrationPrior.of(rectified, camera.sigmas, config.offset_sigma, config.estimate, camera.covariance)
@@ -120,7 +119,7 @@ class StereoTracker:
         self._window = window = KeyframeWindow(rectified, prior.widened(by_check), graphs, usual=prior)
         self._noise = noise = MeasurementNoise(config)
         self._motion = motion = build_motion(backend, imu, odometry, turned)
-        self._course = course = Course()
+        self._blas, self._course = ThreadpoolController(), (course := Course())
         self._shared_errors, self._clock, self._last_pairs = SharedErrors(), FrameClock(motion.sensors), LastPairs()
         self._keyframes = keyframes = Keyframes(window, config.max_keyframes, config.max_points)
         self._frontend = frontend = load()
@@ -207,11 +206,12 @@ class StereoTracker:
         predicted = filtered = self._motion.state
         if fit is not None:
             matches, fit, doubts = self._scrutiny.doubt(frame, matches, fit)
-            status, expected = doubts.status, (self._motion.step, self._motion.step_covariance)
+            expected = self._motion.step, self._motion.step_covariance
             blur, of_matches = self._keyframes.blur(frame.left, matches.views.select(fit.inliers))
             fit = self._correct(fit, of_matches, matches, timestamp)
             filtered = self._motion.state
             tracks = self._mapper.insert_if_due(frame, timestamp, fit, blur, matches, expected, doubts)
+            status = self._scrutiny.doubt_rig(doubts, fit)
         elif is_skipped:
             status, tracks = "skipped", None
         elif change is not None:

@@ -134,6 +134,23 @@ def test_views_of_another_pair_are_not_heard_until_they_go_on_for_two_windows():
     assert np.abs(evidence.beside({})[0] - agreed).max() > 0.01
 
 
+def test_a_frame_is_weighed_as_a_keyframe_is_and_forgotten():
+    slopes, measured = measurements(3, "yaw", 2.0)
+    slopes = np.column_stack([slopes, np.random.default_rng(1).normal(size=(COUNT, 12))])  # by two poses, too
+    views = slopes.T @ slopes / NOISE**2, slopes.T @ measured / NOISE**2
+    evidence, step = CalibrationEvidence(USUAL, CAMERA.fx, load_step("window_condition")), (np.eye(4), 1e-4 * np.eye(6))
+    evidence.add_keyframe(*step)
+    about = WindowState.initial(USUAL).grow(*step, np.zeros(len(ERRORS)))
+    evidence.learn(about, np.zeros(2 * (len(about.covariance),)), np.zeros(len(about.covariance)))
+    about = about.grow(*step, np.zeros(len(ERRORS)))
+    found = evidence.weigh_frame(about, *step, *views)
+    assert evidence.weigh() == {}
+    evidence.add_keyframe(*step)
+    evidence.learn(about, *views)
+    assert found["yaw"].probability > 0.99
+    assert found == pytest.approx(evidence.weigh())
+
+
 # Of `dense_window`: considered errors of calibrations, of which it estimates the first three.
 CONSIDERED_SIGMA = USUAL.sigma[3:]
 
