@@ -1,6 +1,6 @@
 """All checks of a stereo sequence from a few of its frames."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from sigmaslam.checks.inertial import check_inertial, check_times
 from sigmaslam.checks.rig import TOO_FEW, check_pairing, check_rig, find_exchanged, suspect_pairing, unknown_rig
 from sigmaslam.checks.row_fit import MIN_INLIERS, MIN_MATCHES
 from sigmaslam.checks.time_stamps import check_time_stamps
+from sigmaslam.errors import InputError
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.readers.images import ListedPairs
@@ -57,7 +58,7 @@ class Check:
         return {"camera": self.camera, **tracker_arguments(self.findings)}
 
 
-def check_pairs(camera: StereoCamera, pairs: Sequence[tuple[np.ndarray, np.ndarray, float]], threads: int = 2) -> Check:
+def check_pairs(camera: StereoCamera, pairs: Iterable[tuple[np.ndarray, np.ndarray, float]], threads: int = 2) -> Check:
     """Checks the first pairs of a camera, as `sigmaslam track` does, for a tracker without what is wrong with rows.
 
     Example:
@@ -67,9 +68,14 @@ def check_pairs(camera: StereoCamera, pairs: Sequence[tuple[np.ndarray, np.ndarr
         pairs: left and right (H, W) images as they come from the cameras, and seconds; some `PAIRS_BEFORE_TRACKING`.
     Raises:
         CalibrationError: the first images have another size than the calibration.
-        InputError: there is no pair.
+        InputError: these are no pairs, or not one, or an image cannot be used.
     """
-    listed = ListedPairs(pairs)
+    try:
+        listed = ListedPairs([(left, right, float(seconds)) for left, right, seconds in pairs])
+    except (TypeError, ValueError):
+        listed = ListedPairs([])
+    if not listed.length:
+        raise InputError(f"pairs: give some (left, right, seconds) in a row, at best {PAIRS_BEFORE_TRACKING}")
     return check_sequence(StereoSequence(listed, camera, listed.source, "memory"), SAMPLES_BEFORE_TRACKING, threads)
 
 

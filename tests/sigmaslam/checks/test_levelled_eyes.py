@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sigmaslam.checks import check_sequence
+from sigmaslam.checks import check_pairs, check_sequence
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.finding import wrong
 from sigmaslam.checks.levelled_eyes import level_eyes
 from sigmaslam.checks.rig import check_rig
+from sigmaslam.errors import InputError
 from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
 from sigmaslam.geometry.calibration_sigmas import CalibrationSigmas
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
@@ -227,3 +228,17 @@ def test_the_demo_is_tracked_as_well_with_a_right_eye_that_is_off(fault: str, de
         motion = np.linalg.inv(truth[0]) @ truth[len(frames) - 1]
         errors.append(np.linalg.norm(poses[-1][:3, 3] - motion[:3, 3]))
     assert errors[1] < 3.0 * errors[0] + 0.001
+
+
+@pytest.mark.long
+def test_pairs_in_memory_are_checked_as_a_stream_is(demo: Demo):
+    camera, frames, _ = demo
+    sequence = FAULTS["turned by roll 1"].inject(frames[:18], camera)
+    pairs = [(each.left, each.right, each.timestamp) for each in sequence.frames()]
+    streamed, check = (check_pairs(sequence.camera, part) for part in (iter(pairs[:17]), pairs))
+    assert [each.message for each in check.findings] == [each.message for each in streamed.findings]
+    np.testing.assert_allclose(turned_by(check.camera, camera), (0.0, 0.0, 1.0), atol=0.1)
+    assert check.tracker_arguments == {"camera": check.camera, "disparity_error": None, "right_delay": 0.0}
+    for few in ([], [pairs[0][:2]], frames[:17]):
+        with pytest.raises(InputError, match=r"\(left, right, seconds\).*17"):
+            check_pairs(camera, few)
