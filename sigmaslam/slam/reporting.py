@@ -69,8 +69,9 @@ class Reporter:
         else:
             prediction = Prediction.of(self.window, self.motion)
             covariance, part = state.covariance, pose_slice(len(state) - 1)
-            pose, relative = prediction.pose, prediction.covariance
-            absolute, by_error = covariance[part, part] + relative + doubts.spread, state.common[part]
+            pose, relative = prediction.pose, prediction.covariance if fit is None else fit.relative
+            absolute = covariance[part, part] + prediction.covariance + doubts.spread
+            by_error = state.common[part]
             offset = float(state.calibration[0])
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)
         absolute = absolute + shift
