@@ -46,7 +46,7 @@ try:
 except ImportError as error:
     sys.exit(f"{error.name} is not there: source ROS 2's setup.bash, in a Python that has sigmaslam as well")
 
-from sigmaslam import Estimate, StereoTracker
+from sigmaslam import Estimate, StereoCamera, StereoTracker
 from sigmaslam.calibration_files.calibration import read_calibration
 from sigmaslam.checks.check import PAIRS_BEFORE_TRACKING, check_pairs
 from sigmaslam.checks.finding import wrong
@@ -72,7 +72,7 @@ PARAMETERS = {
     "base_frame": "base_link",
     "publish_odom_tf": True,  # false: another node gives odom -> base, such as wheels
     "calibration": "",  # file in place of the CameraInfo, any that `sigmaslam track --calibration` reads
-    "check": True,  # the first pairs, and correct what is wrong with the rows of the right eye
+    "check": True,  # the first 17 pairs, which are not tracked, and correct what is wrong with the right eye's rows
     "mask": "",  # image, black where the left image is not used
     "map": "",  # map.npz of an earlier run with the same camera on the same robot
     "frontend": "learned",
@@ -80,6 +80,8 @@ PARAMETERS = {
 }
 PUBLISHED = ("tracking", "doubtful", "ambiguous", "relocalised")
 """Statuses whose pose images have given."""
+UNSEEN = ("exposure", "overlap")
+"""Findings of images that show nothing of the cameras, as behind a cap."""
 # A variance that gives a velocity that is not known no weight, (m/s)^2 and (rad/s)^2.
 UNKNOWN_VARIANCE = 1e6
 # Seconds without a pair of images until that is an error.
@@ -151,6 +153,7 @@ class SigmaSlamNode(Node):
         self._infos: list[CameraInfo | None] = [None, None]
         self._heard, self._dropped, self._late, self._heard_at = [0, 0], 0, 0, time.monotonic()
         self._tracker: StereoTracker | None = None
+        self._camera: StereoCamera | None = None
         self._mask: np.ndarray | None = None
         self._T_base_camera = np.eye(4)
         self._odometry, self._grey = ContinuousOdometry(), GreyConverter()
@@ -279,7 +282,7 @@ class SigmaSlamNode(Node):
         Raises:
             SigmaSlamError: the calibration, the mask or the map cannot be used.
         """
-        given, size = self._given, (left.width, left.height)
+        given = self._given
         missing = [topic for topic, info in zip(self._info_topics, self._infos, strict=True) if info is None]
         if missing and not given["calibration"]:
             return f"camera_info on {' and '.join(missing)}, or the parameter `calibration`"
@@ -288,23 +291,27 @@ class SigmaSlamNode(Node):
         except TransformException as error:
             return f"the transform from {given['base_frame']} to the camera, {left.header.frame_id} ({error})"
         self._T_base_camera = as_matrix(mounting.transform)
-        if given["calibration"]:
-            camera = read_calibration(Path(given["calibration"]), size)
-        else:
-            camera = stereo_from_messages(*self._infos, tuple(self._topics), tuple(self._info_topics))
-        try:
-            self._mask = read_mask(Path(given["mask"]), *size) if given["mask"] else None
-        except FrameError as error:  # of no single frame
-            raise InputError(str(error)) from None
-        checked = {"camera": camera}
+        if self._camera is None and given["calibration"]:
+            self._camera = read_calibration(Path(given["calibration"]), (left.width, left.height))
+        elif self._camera is None:
+            self._camera = stereo_from_messages(*self._infos, tuple(self._topics), tuple(self._info_topics))
+        camera = self._camera
+        checked: dict[str, Any] = {"camera": camera}
         if given["check"]:
             self._first_pairs.append(pair)
             if (more := PAIRS_BEFORE_TRACKING - len(self._first_pairs)) > 0:
                 return f"{more} more pairs of images, to check the cameras"
-            check = check_pairs(camera, self._first_pairs, given["threads"])
-            self._first_pairs, checked = [], check.tracker_arguments
+            check, self._first_pairs = check_pairs(camera, self._first_pairs, given["threads"]), []
+            if blind := [each.message for each in check.findings if each.severity == "error" and each.name in UNSEEN]:
+                return f"images by which to check the cameras: {blind[0]}"
+            checked = check.tracker_arguments
             for each in wrong(check.findings):
                 self.get_logger().warning(f"{each.name}: {each.message}")
+        try:
+            size = camera.left.width, camera.left.height
+            self._mask = read_mask(Path(given["mask"]), *size) if given["mask"] else None
+        except FrameError as error:  # of no single frame
+            raise InputError(str(error)) from None
         tracker = StereoTracker(**checked, frontend=given["frontend"], threads=given["threads"])
         if given["map"]:
             tracker.load_map(Path(given["map"]))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import cv2
@@ -27,6 +28,7 @@ SAMPLES_BEFORE_TRACKING = 4
 """Pairs that are looked at before tracking: under two seconds."""
 PAIRS_BEFORE_TRACKING = SAMPLED_EVERY * (SAMPLES_BEFORE_TRACKING - 1) + 2
 """Pairs in a row that they are taken from."""
+_NO_PAIR = f"pairs: give some (left, right, seconds) in a row, at best {PAIRS_BEFORE_TRACKING}, with images as arrays"
 # An image that was turned or mirrored gives so many times the matches once that is undone.
 _BETTER = 3.0
 _INTRINSICS = {"principal point", "focal length"}
@@ -65,18 +67,31 @@ def check_pairs(camera: StereoCamera, pairs: Iterable[tuple[np.ndarray, np.ndarr
         tracker = StereoTracker(**check_pairs(camera, pairs).tracker_arguments)
 
     Args:
-        pairs: left and right (H, W) images as they come from the cameras, and seconds; some `PAIRS_BEFORE_TRACKING`.
+        pairs: left and right (H, W) images as they come from the cameras, and seconds; the first
+            `PAIRS_BEFORE_TRACKING` are looked at, those of another size than the calibration's not.
     Raises:
-        CalibrationError: the first images have another size than the calibration.
+        CalibrationError: all images have another size than the calibration.
         InputError: these are no pairs, or not one, or an image cannot be used.
     """
+    listed = [_as_pair(each) for each in islice(pairs, PAIRS_BEFORE_TRACKING)]
+    sizes = [(model.height, model.width) for model in (camera.left, camera.right)]
+    listed = [each for each in listed if [image.shape[:2] for image in each[:2]] == sizes] or listed
+    if not listed:
+        raise InputError(_NO_PAIR)
+    source = ListedPairs(listed)
+    return check_sequence(StereoSequence(source, camera, source.source, "memory"), SAMPLES_BEFORE_TRACKING, threads)
+
+
+def _as_pair(given: Any) -> tuple[np.ndarray, np.ndarray, float]:
+    """A pair of images and seconds; InputError where it is none."""
     try:
-        listed = ListedPairs([(left, right, float(seconds)) for left, right, seconds in pairs])
+        left, right, seconds = given
+        images = np.asarray(left), np.asarray(right)
+        if {image.ndim for image in images} <= {2, 3}:
+            return *images, float(seconds)
     except (TypeError, ValueError):
-        listed = ListedPairs([])
-    if not listed.length:
-        raise InputError(f"pairs: give some (left, right, seconds) in a row, at best {PAIRS_BEFORE_TRACKING}")
-    return check_sequence(StereoSequence(listed, camera, listed.source, "memory"), SAMPLES_BEFORE_TRACKING, threads)
+        pass
+    raise InputError(_NO_PAIR)
 
 
 def check_sequence(

@@ -43,24 +43,29 @@ def change_rig(window: "KeyframeWindow", offset: float) -> None:
     window.evidence = CalibrationEvidence(turned, window.camera.fx, window.graphs.condition, window.expected)
 
 
-def foresee(window: "KeyframeWindow", fit: FrameFit, step: np.ndarray, step_covariance: np.ndarray) -> bool:
+def foresee(
+    window: "KeyframeWindow", fit: FrameFit, step: np.ndarray, step_covariance: np.ndarray, growth: float
+) -> bool:
     """Whether a frame, which knows the offset far better than the window, has another one, or is sure of what is wrong.
 
-    What it finds are causes that are foreseen.
+    What it finds is foreseen until a keyframe comes, as the frame has it that was surest.
 
     Args:
         step, step_covariance: as of `KeyframeWindow.add_keyframe`.
+        growth: by what the variances of the frame's views would be larger in a keyframe.
     """
-    window.foreseen = {}
     known, joint = window.posterior, fit.joint
     departure, variance = fit.calibration[0] - known.calibration[0], known.covariance[0, 0]
-    if joint.covariance[0, 0] > _FAR_BETTER * variance:
+    if joint.covariance[0, 0] >= _FAR_BETTER * variance:
         return False
     poses = se3_exp(joint.step[CALIBRATION_SIZE:-6].reshape(-1, 6)) @ known.poses
     about = replace(known, calibration=fit.calibration, poses=np.concatenate([poses, fit.pose[None]]))
-    causes = window.evidence.weigh_frame(about, step, step_covariance, joint.information, joint.score)
-    window.foreseen = {name: cause for name, cause in causes.items() if name not in window.causes}
-    is_sure = any(cause.probability > 1.0 - HOPELESS for cause in window.foreseen.values())
+    views = joint.information / growth, joint.score / growth
+    found = window.evidence.weigh_frame(about, step, step_covariance, *views)
+    for name in found.keys() - window.causes.keys():
+        before = window.foreseen.get(name, found[name])
+        window.foreseen[name] = max(before, found[name], key=lambda cause: cause.probability)
+    is_sure = any(found[name].probability > 1.0 - HOPELESS for name in found.keys() - window.causes.keys())
     return is_sure or bool(departure**2 > _CONTRADICTS**2 * variance)
 
 

@@ -57,7 +57,7 @@ class KeyframeWindow:
             else than an offset is found to be wrong.
         evidence: weighs what may be wrong.
         causes: of that, what is not hopeless, by its name.
-        foreseen: likewise by the last frame, which knows more.
+        foreseen: likewise by frames since the last keyframe, which know more.
         corrected: (2, 15) what considered errors are taken to be, and their standard deviations beside the usual ones.
         held_offset: what the disparity offset is taken to be in poses that are published.
         board_disparity: pixels where a calibration that is off by more than most is right; None until one is.

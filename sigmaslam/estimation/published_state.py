@@ -31,20 +31,20 @@ def published_state(window: KeyframeWindow) -> WindowState:
 def published_fit(window: KeyframeWindow, fit: FrameFit) -> FrameFit:
     """A frame's fit to the posterior as one to `published_state`."""
     factor, joint = window.clustering, fit.joint
+    growth, sigma = _considered_growth(window), window.calibration.sigma
+    for name, cause in window.foreseen.items():
+        if sigma[k := ERRORS.index(name)] > 0.0:
+            growth[k] = np.hypot(growth[k], np.sqrt(cause.probability * (cause.variance + cause.mean**2)) / sigma[k])
     published = replace(
         joint,
         covariance=factor * joint.covariance,
-        common=joint.common * _considered_growth(window),
+        common=joint.common * growth,
         information=joint.information / factor,
         score=joint.score / factor,
     )
     # Errors that the frame's own views share are in `fit.inflation`: once is enough.
     twice = min(factor, fit.inflation) - 1.0
     covariance = fit.covariance + published.covariance[-6:, -6:] - joint.covariance[-6:, -6:] - twice * joint.relative
-    for name, cause in window.foreseen.items():
-        k = ERRORS.index(name)
-        by_error = joint.common[-6:] @ np.linalg.pinv(window.calibration.considered_factor)[:, k]
-        covariance = covariance + cause.probability * (cause.variance + cause.mean**2) * np.outer(by_error, by_error)
     return replace(fit, covariance=covariance, joint=published)
 
 

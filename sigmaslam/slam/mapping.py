@@ -118,8 +118,17 @@ class Mapper:
         """
         share = fit.count / max(self._landmarks_in_keyframe, 1)
         step, covariance = expected
+        if self.motion.is_inertial:
+            # Its velocity is that of the images, and off alike in all steps of a window: together they know one way.
+            alike = np.sqrt(np.repeat([self.config.window, 1.0], 3))
+            covariance = alike[:, None] * covariance * alike
+            if doubts.prediction_is_wrong:  # as after a sample gone wrong: it would bend the window
+                step = fit.step
+        # What neighbours share counts in what is published: here, it misses the truth by more where the calibration is
+        # off. After a gap they err alike in this view and in all to come: it counts, and they are asked no more.
+        shared = 1.0 if matches.after_gap else fit.clustering
         moved = turn_covariance(self.window.posterior.poses[-1], covariance)
-        if share >= self.config.keyframe_ratio and not foresee(self.window, fit, step, moved):
+        if share >= self.config.keyframe_ratio and not foresee(self.window, fit, step, moved, fit.inflation / shared):
             return None
         # A blurred or spoilt keyframe would spoil what comes after it, too few landmarks spoil more. A sharp view
         # that scatters is one: no keyframes at all for 20 frames lost the KITTI drive.
@@ -134,20 +143,11 @@ class Mapper:
         admitted = view.only(self.admission.admit(view, fit.pose, self.window))
         if not admitted.has_stereo(self.admission.min_points, self.config.min_inliers):
             return None
-        # What neighbours share counts in what is published: here, it misses the truth by more where the calibration is
-        # off. After a gap they err alike in this view and in all to come: it counts, and they are asked no more.
         self._fitted += 1
         self.window.clustering += (fit.clustering - self.window.clustering) / self._fitted
-        shared = 1.0 if matches.after_gap else fit.clustering
         views = matches.views.select(fit.inliers).inflated(fit.noise_scale * fit.inflation / shared)
         if matches.after_gap:
             self.window.landmarks.misses[:] = self.config.max_misses
-        if self.motion.is_inertial:
-            # Its velocity is that of the images, and off alike in all steps of a window: together they know one way.
-            shared = np.sqrt(np.repeat([self.config.window, 1.0], 3))
-            covariance = shared[:, None] * covariance * shared
-            if doubts.prediction_is_wrong:  # as after a sample gone wrong: it would bend the window
-                step = fit.step
         # What moves draws the pose, hidden by streaks or not: frames that see the keyframe's landmarks share that.
         drawn = 0.0 if Doubt.TIME in doubts.reasons else doubts.spread  # the image's own pose knows of no stamp
         spread = (matches.streaked or doubts.is_ambiguous) * drawn

@@ -58,7 +58,7 @@ class Reporter:
         state = published_state(self.window)
         if not len(state):
             return self._report_nothing(timestamp, status, milliseconds)
-        # What the first two keyframes find to be wrong, no frame before knew.
+        # What is wrong is found by the second keyframe: its own pose knew nothing of it.
         has_learned = tracks is not None and len(state) == 2 and bool(self.window.causes)
         if fit is not None and not has_learned:
             # Published alone: a prediction as wide as that would find nothing.

@@ -378,6 +378,23 @@ def test_the_first_pairs_correct_the_rows_of_a_turned_camera(start: Callable[...
     assert "corrected" in node.logged[0]
 
 
+@pytest.mark.long
+def test_pairs_that_show_nothing_or_are_of_another_size_check_no_camera(start: Callable[..., Any], demo_sequence: Path):
+    sequence = open_sequence(demo_sequence)
+    frames = [frame for frame, _ in zip(sequence.frames(), range(36), strict=False)]
+    black = np.zeros_like(frames[0].left)
+    frames[:17] = [replace(each, left=black, right=black) for each in frames[:17]]  # behind a cap
+    frames[17] = replace(frames[17], left=frames[17].left[::2].copy())
+    node = start(check=True)
+    tell_calibration(node, sequence)
+    track(node, frames)
+    words = [words.split(";")[0] for _, words in said(node)]
+    assert words[16].startswith("waiting for images by which to check the cameras: ")
+    assert words[17].startswith("waiting for 16 more pairs")
+    assert words[33:] == ["starting", "tracking", "tracking"]
+    assert node.logged == []
+
+
 def test_what_cannot_be_used_ends_the_node_with_a_reason(start: Callable[..., Any], demo: Any, tmp_path: Path):
     sequence, frames = demo
     cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((240, 320), np.uint8))

@@ -239,6 +239,6 @@ def test_pairs_in_memory_are_checked_as_a_stream_is(demo: Demo):
     assert [each.message for each in check.findings] == [each.message for each in streamed.findings]
     np.testing.assert_allclose(turned_by(check.camera, camera), (0.0, 0.0, 1.0), atol=0.1)
     assert check.tracker_arguments == {"camera": check.camera, "disparity_error": None, "right_delay": 0.0}
-    for few in ([], [pairs[0][:2]], frames[:17]):
+    for few in ([], [pairs[0][:2]], frames[:17], [(None, None, 0.0)], [(np.zeros(3), np.zeros(3), 0.0)]):
         with pytest.raises(InputError, match=r"\(left, right, seconds\).*17"):
             check_pairs(camera, few)
