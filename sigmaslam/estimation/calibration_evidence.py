@@ -121,15 +121,10 @@ class CalibrationEvidence:
         """The prior with what views say, if they are heard; whether they speak of the same pair as all before them."""
         vector = vector + information @ about.minus(self._prior)
         state = self._prior.given(information, vector, self._condition)
-        before, after = self._shown(self._prior), self._shown(state)
+        before, after = (_shown(*self._in_usual_sigmas(each)) for each in (self._prior, state))
         views = after[0] - before[0], after[1] - before[1]
         agrees = _evidence(*after) - _evidence(*before) - _evidence(*views) > _CONTRADICTION
         return state if agrees or self._contradicted >= _PATIENCE else self._prior, agrees
-
-    def _shown(self, state: WindowState) -> tuple[np.ndarray, np.ndarray]:
-        """L (15, 15) and y (15,) of a state in the usual sigmas, by the part that views count."""
-        mean, _, precision = self._in_usual_sigmas(state)
-        return (precision - np.eye(len(ERRORS))) / _ALIKE, precision @ mean / _ALIKE
 
     def weigh_frame(
         self,
@@ -178,7 +173,7 @@ class CalibrationEvidence:
         Returns:
             (15,) the errors that they show, by the usual sigmas; by what factor these errors are larger, 1 or more.
         """
-        identity, (information, vector) = np.eye(len(ERRORS)), self._shown(self._posterior)
+        identity, (information, vector) = np.eye(len(ERRORS)), _shown(*self._in_usual_sigmas(self._posterior))
         spreads = [np.sqrt(cause.probability) * self._spreads[name] for name, cause in causes.items()]
         more = sum((np.outer(each, each) for each in spreads), np.zeros_like(identity))
         shown = np.isin(ERRORS, SHOWN) & self._is_uncertain
@@ -192,6 +187,11 @@ class CalibrationEvidence:
         """Mean (15,), covariance and precision (15, 15) of the errors in the usual sigmas: S is the identity there."""
         covariance = state.covariance[CALIBRATION, CALIBRATION] / np.outer(self._sigma, self._sigma)
         return (state.calibration - self.expected) / self._sigma, covariance, np.linalg.inv(covariance)
+
+
+def _shown(mean: np.ndarray, covariance: np.ndarray, precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """L (15, 15) and y (15,) of a state in the usual sigmas, by the part that views count."""
+    return (precision - np.eye(len(ERRORS))) / _ALIKE, precision @ mean / _ALIKE
 
 
 def _evidence(information: np.ndarray, vector: np.ndarray) -> float:
