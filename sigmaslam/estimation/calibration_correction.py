@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 # An error of the calibration beyond so many standard deviations of its prior is none that calibrations usually have.
 _CREDIBLE = 4.0
-# A frame speaks for itself where its variance is so much smaller than the window's: half of the standard deviation. One
-# that departs by more than so many of the window's sigmas contradicts it: one in eight is, of two too few frames.
+# A frame is asked where its variance of the offset is so much smaller than the window's: by half of the sigma. It
+# contradicts where it departs by so many of the window's, as one calibration in eight; of 1, 1.5, 2 this serves best.
 _FAR_BETTER, _CONTRADICTS = 0.25, 1.5
 # Boards are held within arm's reach: there depths are right, whatever else a calibration has wrong, metres.
 _REACH = 0.5
@@ -62,10 +62,10 @@ def foresee(
     about = replace(known, calibration=fit.calibration, poses=np.concatenate([poses, fit.pose[None]]))
     views = joint.information / growth, joint.score / growth
     found = window.evidence.weigh_frame(about, step, step_covariance, *views)
-    for name in found.keys() - window.causes.keys():
-        before = window.foreseen.get(name, found[name])
-        window.foreseen[name] = max(before, found[name], key=lambda cause: cause.probability)
-    is_sure = any(found[name].probability > 1.0 - HOPELESS for name in found.keys() - window.causes.keys())
+    new = {name: cause for name, cause in found.items() if name not in window.causes}
+    for name, cause in new.items():
+        window.foreseen[name] = max(window.foreseen.get(name, cause), cause, key=lambda each: each.probability)
+    is_sure = any(cause.probability > 1.0 - HOPELESS for cause in new.values())
     return is_sure or bool(departure**2 > _CONTRADICTS**2 * variance)
 
 
