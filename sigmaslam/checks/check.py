@@ -78,19 +78,18 @@ def check_pairs(camera: StereoCamera, pairs: Iterable[tuple[np.ndarray, np.ndarr
     listed = [each for each in listed if [image.shape[:2] for image in each[:2]] == sizes] or listed
     if not listed:
         raise InputError(_NO_PAIR)
-    source = ListedPairs(listed)
-    return check_sequence(StereoSequence(source, camera, source.source, "memory"), SAMPLES_BEFORE_TRACKING, threads)
+    sequence = StereoSequence(ListedPairs(listed), camera, ListedPairs.source, "memory")
+    return check_sequence(sequence, SAMPLES_BEFORE_TRACKING, threads)
 
 
 def _as_pair(given: Any) -> tuple[np.ndarray, np.ndarray, float]:
     """A pair of images and seconds; InputError where it is none."""
     try:
-        left, right, seconds = given
-        images = np.asarray(left), np.asarray(right)
-        if {image.ndim for image in images} <= {2, 3}:
-            return *images, float(seconds)
-    except (TypeError, ValueError):
-        pass
+        (left, right), seconds = map(np.asarray, given[:2]), float(given[2])
+    except (TypeError, ValueError, IndexError):
+        raise InputError(_NO_PAIR) from None
+    if {left.ndim, right.ndim} <= {2, 3}:
+        return left, right, seconds
     raise InputError(_NO_PAIR)
 
 

@@ -60,8 +60,7 @@ def foresee(
         return False
     poses = se3_exp(joint.step[CALIBRATION_SIZE:-6].reshape(-1, 6)) @ known.poses
     about = replace(known, calibration=fit.calibration, poses=np.concatenate([poses, fit.pose[None]]))
-    views = joint.information / growth, joint.score / growth
-    found = window.evidence.weigh_frame(about, step, step_covariance, *views)
+    found = window.evidence.weigh_frame(about, step, step_covariance, joint.information / growth, joint.score / growth)
     new = {name: cause for name, cause in found.items() if name not in window.causes}
     for name, cause in new.items():
         window.foreseen[name] = max(window.foreseen.get(name, cause), cause, key=lambda each: each.probability)
