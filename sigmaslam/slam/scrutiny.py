@@ -179,10 +179,23 @@ class Scrutiny:
         prediction = Prediction.of(self._window, self._motion)
         return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
+    def _stands_dead(self, matches: GuidedMatches, fit: FrameFit) -> bool:
+        """Whether landmarks stay, in the next image of a camera that was about to move them twenty times as far."""
+        if self._stop is not None or self._clock.is_slow:
+            return False
+        rows = matches.views.landmark
+        stays = seen_apart(self._window, rows, self._pose, fit.pose) < 0.5 * ACCEPTANCE.stands
+        if 2 * stays.sum() <= len(stays):
+            return False
+        expected = seen_apart(self._window, rows, self._pose, Prediction.of(self._window, self._motion).pose)
+        return bool(2 * (expected > 20.0 * ACCEPTANCE.stands).sum() > len(expected))
+
     def _doubt_prediction(self, doubts: Doubts, matches: GuidedMatches, fit: FrameFit) -> None:
         # What goes on is an acceleration: images out of order jump to and fro, and once some came others may.
         expects = self._had_other_times or self._last_error != 0.0
         error = time_error(self._motion, fit.step, self._clock.interval, expects)
+        if error == 0.0 and self._stands_dead(matches, fit):
+            error = -1.0  # no camera does, though the noise of its motion may allow it
         is_other = error * self._last_error < 0.0 or (error != 0.0 and self._last_error == 0.0)
         excess = surprise(self._motion, fit.step)
         if is_other:
