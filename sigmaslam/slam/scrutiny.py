@@ -180,8 +180,8 @@ class Scrutiny:
         return prediction.excludes(second.pose) and not prediction.excludes(fit.pose)
 
     def _stands_dead(self, matches: GuidedMatches, fit: FrameFit) -> bool:
-        """Whether landmarks stay, in the next image of a camera that was about to move them twenty times as far."""
-        if self._stop is not None or self._clock.is_slow:
+        """Whether landmarks stay, in the very next image of a camera that was about to move them forty times as far."""
+        if self._stop is not None or self._clock.is_slow or self._course.tracked_at != self._course.timestamp:
             return False
         rows = matches.views.landmark
         stays = seen_apart(self._window, rows, self._pose, fit.pose) < 0.5 * ACCEPTANCE.stands

@@ -12,6 +12,7 @@ from sigmaslam.readers import open_sequence
 from sigmaslam.readers.selection import Selection
 from sigmaslam.slam.frozen_images import LastPairs, is_noise, shows_motion
 from sigmaslam.slam.tracker import StereoTracker
+from sigmaslam_benchmarks.live.driver_faults import DrivenFrame, freeze_anew, start_of
 from tests.support.estimates import Demo
 
 
@@ -146,3 +147,16 @@ def test_frozen_frames_are_skipped_and_tracking_goes_on_where_the_camera_is(demo
         sigma = np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1])
         assert k == 0 or np.linalg.norm(away) < 4.0 * sigma + 1e-9
         assert estimate.status == ("starting" if k == 0 else "skipped" if 12 <= k < 16 else "tracking")
+
+
+@pytest.mark.long
+@pytest.mark.data
+def test_a_stream_that_goes_on_without_its_shaken_camera_is_doubtful(real_data: Path):
+    """At 10 Hz the noise of a hand's motion allows such a stop; poses were 50 mm off at 100 sigmas."""
+    sequence = open_sequence(real_data / "euroc_mh01_f000_099").select(Selection(every=2))
+    frames = [DrivenFrame(each.index, each.timestamp, each.left, each.right) for each in sequence.frames()]
+    tracker, first = StereoTracker(sequence.camera, threads=1), start_of(frames)
+    delivered = freeze_anew(7, frames, np.random.default_rng(0))[: first + 7]
+    statuses = [tracker.step(each.left, each.right, each.timestamp).status for each in delivered]
+    assert statuses[1:first] == ["tracking"] * (first - 1)
+    assert {*statuses[first:]} <= {"doubtful", "skipped"}
