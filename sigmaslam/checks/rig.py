@@ -27,9 +27,8 @@ _EXPLAINED, _BETTER = 0.5, 2.0
 _WARN_LAG = 0.5
 # Many matches share it: far places, which are most, hide what near ones show.
 _LEAST_LAG = 0.05
-# And one that explains a smaller share of the variance of rows than this may stand for something else; of one beyond so
-# many frames, which no lens looked like (0.021 at most, of six recordings with faults), the lesser share suffices.
-_LAG_SHARE, _LENS_LAG, _LESSER_SHARE = 1 / 3, 0.03, 1 / 5
+# And one that explains a smaller share of the variance of rows than this may stand for something else.
+_LAG_SHARE = 1 / 3
 # Rows in the stored images agree within this if these are rectified already, pixels.
 _RECTIFIED_ROWS = 0.5
 _SYNCHRONISATION = "synchronisation"
@@ -172,8 +171,7 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
         )
     sigma = float(fit.sigmas[4])
     figure = f"{abs(fit.lag):.2f} ± {sigma:.2f} of a frame{_milliseconds(fit.lag, frame_interval)}"
-    share = _LESSER_SHARE if abs(fit.lag) > _LENS_LAG else _LAG_SHARE
-    explained = _mad(fit.residual) ** 2 < (1.0 - share) * _mad(fit.residual + fit.by_lag[:, 1]) ** 2
+    explained = _mad(fit.residual) ** 2 < (1.0 - _LAG_SHARE) * _mad(fit.residual + fit.by_lag[:, 1]) ** 2
     if fit.lag_shift < _LEAST_LAG or not explained:
         return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
     message = (
