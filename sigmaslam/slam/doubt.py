@@ -28,7 +28,8 @@ class Doubts:
 
     Attributes:
         reasons: each once, in the order in which they were found.
-        spread: (6, 6) by what they make the pose that is published less certain, perturbed from the left in the world.
+        spread: (6, 6) by what they make the image's pose less certain, perturbed from the left in the world.
+        by_stamp: (6, 6) likewise, the pose at its time stamp alone, which is published.
         prediction_is_wrong: it was made less certain, so that the same matches give another pose.
         is_ambiguous: another pose explains the image about as well.
         spoils_keyframe: it is that, or nearer landmarks, which may move, draw the pose away from that of the others.
@@ -36,6 +37,7 @@ class Doubts:
 
     reasons: list[Doubt] = field(default_factory=list)
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    by_stamp: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     prediction_is_wrong: bool = False
     is_ambiguous: bool = False
     spoils_keyframe: bool = False

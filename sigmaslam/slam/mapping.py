@@ -18,7 +18,7 @@ from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
 from sigmaslam.geometry.se3 import turn_covariance
 from sigmaslam.slam.config import TrackerConfig
-from sigmaslam.slam.doubt import Doubt, Doubts
+from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.keyframes import Keyframes
@@ -149,8 +149,7 @@ class Mapper:
         if matches.after_gap:
             self.window.landmarks.misses[:] = self.config.max_misses
         # What moves draws the pose, hidden by streaks or not: frames that see the keyframe's landmarks share that.
-        drawn = 0.0 if Doubt.TIME in doubts.reasons else doubts.spread  # the image's own pose knows of no stamp
-        spread = (matches.streaked or doubts.is_ambiguous) * drawn
+        spread = (matches.streaked or doubts.is_ambiguous) * doubts.spread
         spread = spread + matches.streaked * (1.0 - 1.0 / fit.clustering) * fit.relative
         tracks = self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
         self.keyframes.active[-1] = replace(self.keyframes.active[-1], spread=spread)

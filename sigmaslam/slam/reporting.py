@@ -62,7 +62,7 @@ class Reporter:
         has_learned = tracks is not None and len(state) == 2 and bool(self.window.causes)
         if fit is not None and not has_learned:
             # Published alone: a prediction as wide as that would find nothing.
-            fit = published_fit(self.window, fit).spread_by(doubts.spread)
+            fit = published_fit(self.window, fit).spread_by(doubts.spread + doubts.by_stamp)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             by_error, offset = fit.joint.common[-6:], float(fit.calibration[0])
             covariance, part = fit.joint.covariance, slice(-6, None)
@@ -70,7 +70,7 @@ class Reporter:
             prediction = Prediction.of(self.window, self.motion)
             covariance, part = state.covariance, pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance if fit is None else fit.relative
-            absolute = covariance[part, part] + prediction.covariance + doubts.spread
+            absolute = covariance[part, part] + prediction.covariance + doubts.spread + doubts.by_stamp
             by_error = state.common[part]
             offset = float(state.calibration[0])
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)

@@ -16,7 +16,7 @@ from sigmaslam.estimation.mahalanobis import squared_mahalanobis
 from sigmaslam.estimation.prediction_errors import surprise
 from sigmaslam.geometry.image_cells import explained_area
 from sigmaslam.geometry.se3 import se3_exp, se3_inverse, se3_log, transform_points
-from sigmaslam.slam.doubt import Doubts
+from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.localisation import Localiser
 from sigmaslam.slam.moving_region import MovingRegion
@@ -47,6 +47,21 @@ def test_no_matches_that_depart_explain_more_than_the_bound(seed: int) -> None:
 
 def test_matches_that_stay_where_they_are_bound_nothing_else_in() -> None:
     assert not _most_departing(np.zeros(12, np.int64), np.arange(9), np.full(9, 1.0)).any()
+
+
+@pytest.mark.parametrize("way", [[0.0, 0.0, 0.0], [-0.02, 0.0, 0.0]])
+def test_what_moves_makes_a_keyframe_as_uncertain_where_the_stamp_is_doubtful_too(way: list[float]) -> None:
+    """An image of another time is a keyframe as good as any, but what moves may have drawn its pose all the same."""
+    found = []
+    for expects in (False, True):
+        localiser, matches, fit = scene(0, way, sigma=0.001)
+        scrutiny = Scrutiny(localiser, FrameClock(), Course(), MovingRegion(8.0, 10), False)
+        scrutiny._had_other_times = expects
+        found.append(scrutiny.doubt(black(), matches, fit)[2])
+    assert [Doubt.TIME in each.reasons for each in found] == [False, True]
+    assert [each.by_stamp.any() for each in found] == [False, True]
+    assert found[0].spread.any()
+    assert np.array_equal(found[0].spread, found[1].spread)
 
 
 def black() -> Any:
