@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,32 +11,16 @@ import numpy as np
 
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.readers import StereoFrame, StereoSequence
-from sigmaslam.readers.images import RawPair
+from sigmaslam.readers.images import ListedPairs
 
 Frames = list[StereoFrame]
 EUROC_LENS = (-0.283, 0.0740, 0.0002, 0.00002)
 
 
-class MemoryPairs:
-    """Frames as a source of pairs, read in order as from a bag."""
-
-    def __init__(self, frames: Frames) -> None:
-        self.timestamps: list[float] | None = [frame.timestamp for frame in frames]
-        self.length: int | None = len(frames)
-        self._frames = frames
-
-    @property
-    def first_pair(self) -> RawPair:
-        return next(iter(self))
-
-    def __iter__(self) -> Iterator[RawPair]:
-        for index, frame in enumerate(self._frames):
-            yield RawPair(index, frame.timestamp, frame.left, frame.right, "left", "right")
-
-
 def sequence_of(frames: Frames, camera: StereoCamera) -> StereoSequence:
     """A sequence in memory."""
-    return StereoSequence(MemoryPairs(frames), camera, "memory", "memory")
+    pairs = [(frame.left, frame.right, frame.timestamp) for frame in frames]
+    return StereoSequence(ListedPairs(pairs), camera, "memory", "memory")
 
 
 @dataclass(frozen=True)
