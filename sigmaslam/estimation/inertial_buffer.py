@@ -5,6 +5,7 @@ import numpy as np
 from sigmaslam.estimation.gaussian import regression
 from sigmaslam.estimation.preintegration import Preintegrated, preintegrate
 from sigmaslam.estimation.sample_buffer import SampleBuffer
+from sigmaslam.estimation.standstill import WHILE
 from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 
 # The noise is at least five times that of a data sheet, which holds at rest: in flight it is 3 to 17 times that, and
@@ -12,8 +13,6 @@ from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 _FIRST_SCALE, _ADAPTATION, _MOST_SURPRISE = 25.0, 0.05, 3.0
 # So many times the densities' variance is no noise any more but another fault.
 _LARGEST_SCALE = 1e4
-# Seconds before a motion whose samples tell by how much those in a gap may have changed: the tracker keeps no more.
-_RECENT = 0.5
 
 
 class InertialBuffer(SampleBuffer):
@@ -34,7 +33,7 @@ class InertialBuffer(SampleBuffer):
             biases: (6,) of gyro and accelerometer.
             densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
         """
-        table = self.around(start - _RECENT, end)
+        table = self.around(start - WHILE, end)  # what a gap may have changed by is told by those before
         start, end = start + self.time_shift, end + self.time_shift
         if len(table) < 2 or table[-1, 0] <= start:
             return None
