@@ -10,7 +10,7 @@ from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.finding import Finding, Severity
 from sigmaslam.checks.hypotheses import exchange_eyes, leave_unrectified, stand_upright
 from sigmaslam.checks.levelled_eyes import WARN_ROWS, LevelledEyes, level_eyes
-from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows
+from sigmaslam.checks.row_fit import MIN_MATCHES, SIGNIFICANT, RowFit, fit_rows, follows_motion
 from sigmaslam.frontend.row_search import ROW_TOLERANCE
 from sigmaslam.geometry.camera import RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
@@ -27,8 +27,9 @@ _EXPLAINED, _BETTER = 0.5, 2.0
 _WARN_LAG = 0.5
 # Many matches share it: far places, which are most, hide what near ones show.
 _LEAST_LAG = 0.05
-# And one that explains a smaller share of the variance of rows than this may stand for something else.
-_LAG_SHARE = 1 / 3
+# And one that explains a smaller share of the variance of rows than this may stand for something else; the lesser one
+# suffices where nothing but the motion looks like it.
+_LAG_SHARE, _LESSER_SHARE = 1 / 3, 1 / 5
 # Rows in the stored images agree within this if these are rectified already, pixels.
 _RECTIFIED_ROWS = 0.5
 _SYNCHRONISATION = "synchronisation"
@@ -171,8 +172,9 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
         )
     sigma = float(fit.sigmas[4])
     figure = f"{abs(fit.lag):.2f} ± {sigma:.2f} of a frame{_milliseconds(fit.lag, frame_interval)}"
-    explained = _mad(fit.residual) ** 2 < (1.0 - _LAG_SHARE) * _mad(fit.residual + fit.by_lag[:, 1]) ** 2
-    if fit.lag_shift < _LEAST_LAG or not explained:
+    explained = 1.0 - _mad(fit.residual) ** 2 / max(_mad(fit.residual + fit.by_lag[:, 1]) ** 2, 1e-12)
+    is_late = explained > _LAG_SHARE or (explained > _LESSER_SHARE and follows_motion(fit))
+    if fit.lag_shift < _LEAST_LAG or not is_late:
         return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
     message = (
         f"the right images are {figure} {_when(fit.lag)} than the left ones, which moves them by {fit.lag_shift:.1f} "

@@ -13,6 +13,8 @@ _ITERATIONS = 20
 _ROBUST, _MIN_SIGMA = 2.0, 0.05
 # Causes count where they are larger than so many standard deviations.
 SIGNIFICANT = 5.0
+# A lag that each pair shows by itself is so many standard deviations by pairs, of which there are few.
+_STEADY = 3.0
 # Rigs are compared by residuals up to about this size, pixels: matches err by 0.1 to 0.2.
 _COMPARED = 0.3
 MIN_INLIERS = 15
@@ -92,6 +94,20 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
     flow = matches.flow if moving else np.zeros_like(matches.flow)
     places = unit, lag * flow, rows - columns @ coefficients
     return RowFit(matches, shift, roll, zoom, yaw, lag if moving else np.nan, sigmas, *places)
+
+
+def follows_motion(fit: RowFit) -> bool:
+    """Whether rows show its lag, nearly, beside all that stays in its place, as lenses do, and in all pairs alike."""
+    matches, x, y, pairs = fit.matches, fit.unit["roll"], fit.unit["zoom"], np.unique(fit.matches.pair)
+    if len(pairs) == 1:
+        return False
+    bends = [x, y, x * y, x * x, y * y, x**3, x * x * y, x * y * y, y**3]
+    columns = np.column_stack([fit.unit["shift"], matches.flow[:, 1], *bends])
+    parts = [slice(None), *(matches.pair != pair for pair in pairs)]
+    rows, chances = matches.row_difference, matches.probability
+    (lag, sigma), *without = [[each[1] for each in _fit(columns[k], rows[k], chances[k])] for k in parts]
+    jackknife = np.sqrt(len(pairs) - 1.0) * np.std([each for each, _ in without])
+    return bool(abs(lag) > max(SIGNIFICANT * sigma, _STEADY * jackknife, 2.0 * abs(lag - fit.lag)))
 
 
 def misfit(matches: EyeMatches, camera: RectifiedStereo) -> float:

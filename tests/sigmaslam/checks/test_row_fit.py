@@ -1,11 +1,13 @@
 """Row differences of matches whose causes are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sigmaslam.checks.eye_matches import EyeMatches
 from sigmaslam.checks.rig import check_rig
-from sigmaslam.checks.row_fit import fit_rows
+from sigmaslam.checks.row_fit import fit_rows, follows_motion
 from sigmaslam.geometry.camera import CameraModel, RectifiedStereo, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 
@@ -127,6 +129,19 @@ def test_a_delay_of_a_few_milliseconds_is_told_in_seconds():
     # Stamps in milliseconds: no velocity lasts so long, and no tracker takes that.
     found = {each.name: each for each in check_rig(matches_of(lag=0.1), StereoRectifier(camera()), 100.0)[0]}
     assert (found["synchronisation"].severity, found["synchronisation"].delay) == ("warning", 0.0)
+
+
+@pytest.mark.parametrize(("lag", "bend", "is_late"), [(0.0, 0.0, False), (0.05, 0.0, True), (0.0, 8.0, False)])
+def test_a_lens_that_looks_like_a_delay_follows_no_motion(lag: float, bend: float, is_late: bool):
+    """What is nearer the further it is from the middle, as a road: rows that a lens bends look like its flow."""
+    matches = matches_of(count=1200, outliers=0.0)
+    x, y = ((matches.right - (VIEW.cx, VIEW.cy)) / VIEW.fx).T
+    pair = np.arange(1200) % 4
+    flow = ((100.0 + 25.0 * pair) * y**2)[:, None] * np.column_stack([x, y])
+    matches.right[:, 1] += lag * flow[:, 1] + bend * y**3
+    fit = fit_rows(replace(matches, flow=flow, pair=pair), VIEW)
+    assert (abs(fit.lag) > 5.0 * fit.sigmas[4]) == bool(lag or bend)
+    assert follows_motion(fit) == is_late
 
 
 def test_a_bump_between_two_pairs_is_no_delay():
