@@ -27,6 +27,7 @@ class Keyframe:
         blur: of its image, as of `Keyframes.blur`.
         points: landmarks that it was the anchor of, in its frame, once it has left the window.
         spread: (6, 6) by which its pose is less certain than its views say, perturbed from the left in the world.
+        drawn: (6, 6) likewise, its part of what moves, on which later keyframes rest.
     """
 
     id: int
@@ -36,6 +37,7 @@ class Keyframe:
     blur: float = 1.0
     points: PointMap = field(default_factory=PointMap.empty)
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    drawn: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
     # As of `HangingKeyframe`: it hangs at itself.
     step, covariance = np.eye(4), np.zeros((6, 6))

@@ -16,7 +16,7 @@ from sigmaslam.frontend.feature_spacing import select_spaced
 from sigmaslam.frontend.image_sharpness import is_defocused
 from sigmaslam.frontend.plane_alignment import disparity_slopes
 from sigmaslam.geometry.camera import RectifiedStereo
-from sigmaslam.geometry.se3 import turn_covariance
+from sigmaslam.geometry.se3 import se3_inverse, turn_covariance
 from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.doubt import Doubts
 from sigmaslam.slam.frame import Frame
@@ -30,6 +30,12 @@ from sigmaslam.table import Table
 _FULL_SPACING_FROM, _LEAST_SPACING = 640 * 480, 2 / 3
 # The scene is no farther away than where its disparity is this, pixels.
 _MIN_DISPARITY = 0.5
+
+
+def _in_all_directions(spread: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """A covariance (6, 6) as large in all directions of the camera: where something drew it once is not all it did."""
+    own = np.diag(turn_covariance(se3_inverse(pose), spread)).reshape(2, 3)
+    return turn_covariance(pose, np.diag(np.repeat(own.mean(axis=1), 3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,17 +155,22 @@ class Mapper:
         if matches.after_gap:
             self.window.landmarks.misses[:] = self.config.max_misses
         # What moves draws the pose, hidden by streaks or not: frames that see the keyframe's landmarks share that.
-        spread = (matches.streaked or doubts.is_ambiguous) * doubts.spread
-        spread = spread + matches.streaked * (1.0 - 1.0 / fit.clustering) * fit.relative
+        drawn = self._of_keyframes("drawn", views) + (matches.streaked or doubts.is_ambiguous) * doubts.spread
+        drawn = _in_all_directions(drawn, fit.pose)
+        spread = drawn + matches.streaked * (1.0 - 1.0 / fit.clustering) * (fit.relative - self.spread(views))
         tracks = self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
-        self.keyframes.active[-1] = replace(self.keyframes.active[-1], spread=spread)
+        self.keyframes.active[-1] = replace(self.keyframes.active[-1], drawn=drawn, spread=spread)
         return tracks
 
     def spread(self, seen: LandmarkViews) -> np.ndarray:
         """(6, 6) by which a pose is less certain than its views say, as the keyframes of their landmarks are."""
+        return self._of_keyframes("spread", seen)
+
+    def _of_keyframes(self, name: str, seen: LandmarkViews) -> np.ndarray:
+        """(6, 6) mean of an attribute of keyframes, by what views of their landmarks weigh."""
         keyframes, weight = self.keyframes.active, 1.0 / np.trace(seen.noise[:, :2, :2], axis1=1, axis2=2)
         share = np.bincount(self.window.landmarks.anchor[seen.landmark], weight, len(keyframes)) / weight.sum()
-        return np.asarray(np.tensordot(share, [keyframe.spread for keyframe in keyframes], 1))
+        return np.asarray(np.tensordot(share, [getattr(each, name) for each in keyframes], 1))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.

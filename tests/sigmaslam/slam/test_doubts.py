@@ -13,6 +13,7 @@ import pytest
 from sigmaslam.estimation.chi_square import CHI_SQUARE_999
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam import scrutiny
+from sigmaslam.slam.config import TrackerConfig
 from sigmaslam.slam.doubt import Doubt, Doubts
 from sigmaslam.slam.frame import Frame
 from sigmaslam.slam.guided_matching import GuidedMatches
@@ -289,6 +290,33 @@ def test_frames_that_see_landmarks_of_a_doubted_keyframe_share_what_its_pose_lea
             assert np.linalg.eigvalsh(more)[0] > -1e-9 * np.trace(more)
         else:
             assert not more.any()
+
+
+def test_keyframes_that_rest_on_a_doubted_one_are_uncertain_once_it_has_left(
+    demo: Demo, monkeypatch: pytest.MonkeyPatch
+):
+    """By as much as they rest on it, and in all directions: what moves does not draw all of them the same way."""
+    camera, frames, _ = demo
+    insert, runs = Mapper.insert_if_due, []
+    one_way = np.diag([0.0, 0.0, 1e-2, 0.0, 0.0, 0.0])
+    for spread in (np.zeros((6, 6)), one_way):
+        made: list[KeyframeTracks] = []
+
+        def insert_doubted(
+            mapper: Mapper, *given: Any, spread: np.ndarray = spread, made: list[KeyframeTracks] = made
+        ) -> KeyframeTracks | None:
+            doubts = Doubts() if made else Doubts(spread=spread, is_ambiguous=True)
+            tracks = insert(mapper, *given[:6], doubts)
+            made += [] if tracks is None else [tracks]
+            return tracks
+
+        monkeypatch.setattr(Mapper, "insert_if_due", insert_doubted)
+        tracker = StereoTracker(camera, config=TrackerConfig(window=3, keyframe_ratio=1.0))
+        runs.append(track(tracker, frames))
+        assert len(made) > 6
+    more = np.diag(runs[1][-1].covariance - runs[0][-1].covariance)[:3]
+    np.testing.assert_allclose(more, more.mean(), rtol=0.01)
+    assert 0.1 < more.sum() / np.trace(one_way) < 1.0
 
 
 def test_what_neighbours_share_in_keyframes_makes_poses_less_certain_and_moves_none(
