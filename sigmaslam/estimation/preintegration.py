@@ -91,7 +91,7 @@ def preintegrate(
     is_gap = gaps > _GAP * period
     is_bridged = is_gap & (gaps <= _BRIDGED) & ~before_first & ~behind_last
     is_missing = is_gap & ~is_bridged
-    spectra = np.tile([sensor.gyro_density**2, sensor.accel_density**2], (len(steps), 1))
+    spectra = np.tile(np.square([sensor.gyro_density, sensor.accel_density], dtype=float), (len(steps), 1))
     for k in np.flatnonzero(is_bridged):
         spectra[k] += [bridge_spectrum(t, values, gaps[k]).mean() for values in (samples.gyro, samples.accel)]
     # A rate that goes from end to end with an unknown angular acceleration, as a Brownian bridge.

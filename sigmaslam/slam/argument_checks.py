@@ -12,6 +12,8 @@ from sigmaslam.estimation.constant_velocity import MotionFilter
 from sigmaslam.estimation.sample_buffer import SampleBuffer
 from sigmaslam.frontend.types import check_grey
 from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.inertial_sensor import InertialSensor
+from sigmaslam.geometry.odometry_sensor import OdometrySensor
 from sigmaslam.inference.backends import ONNX, backend_names
 from sigmaslam.slam.config import TrackerConfig
 
@@ -19,6 +21,7 @@ from sigmaslam.slam.config import TrackerConfig
 _LONGEST_PAUSE = 1e5
 MAX_DELAY = 1.0
 """Of the right eye, seconds: more are another unit, or frames so far apart that no velocity lasts."""
+_DENSITIES = ("gyro_density", "gyro_walk", "accel_density", "accel_walk")
 _FRONTEND_METHODS = ("name", "observe", "match", "follow")
 
 
@@ -30,6 +33,8 @@ def check_tracker_arguments(
     threads: object,
     weights: object = None,
     right_delay: object = 0.0,
+    imu: Any = None,
+    odometry: Any = None,
 ) -> None:
     """The arguments with which a tracker is made.
 
@@ -50,6 +55,13 @@ def check_tracker_arguments(
         raise InputError(f"weights {weights} are for a front-end by name: give the networks to your own one instead")
     if not isinstance(right_delay, Real) or not abs(float(right_delay)) < MAX_DELAY:
         raise _wrong("right_delay", right_delay, "seconds, such as 0.01 for ten milliseconds")
+    if imu is not None:
+        _check_sensor("imu", imu, InertialSensor, "T_left_imu")
+        measured = [name for name in _DENSITIES if imu.has_accelerometer or name.startswith("gyro")]
+        if wrong := [name for name in measured if not 0.0 < getattr(imu, name) < math.inf]:
+            raise _wrong(f"imu.{wrong[0]}", getattr(imu, wrong[0]), "the density of the data sheet, above zero")
+    if odometry is not None:
+        _check_sensor("odometry", odometry, OdometrySensor, "T_left_base")
 
 
 def check_sample(motion: MotionFilter, name: str, timestamp: float, one: Any, other: Any) -> SampleBuffer:
@@ -123,6 +135,18 @@ def check_mask(mask: Any, width: int, height: int) -> None:
         raise FrameError(f"mask is {given}: give a bool or uint8 array ({height}, {width}) of the raw left image")
     if not mask.any():
         raise FrameError("mask is zero everywhere: what may be used of the left image must not be zero")
+
+
+def _check_sensor(name: str, sensor: Any, kind: type[InertialSensor | OdometrySensor], mounting: str) -> None:
+    """A sensor beside the cameras: where it is, and its clock."""
+    if not isinstance(sensor, kind):
+        raise _wrong(name, sensor, f"an {kind.__name__}, such as read_{name}(path).sensor of sigmaslam.readers")
+    T = np.asarray(getattr(sensor, mounting))
+    is_rigid = T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
+    if not is_rigid or np.linalg.det(T[:3, :3]) < 0.0:
+        raise _wrong(f"{name}.{mounting}", T.tolist(), "a rotation with a translation, (4, 4)")
+    if not math.isfinite(sensor.time_shift):
+        raise _wrong(f"{name}.time_shift", sensor.time_shift, "seconds")
 
 
 def _wrong(name: str, value: object, expected: str) -> InputError:

@@ -104,7 +104,7 @@ class StereoTracker:
         odometry: OdometrySensor | None = None,
         right_delay: float = 0.0,
     ) -> None:
-        check_tracker_arguments(camera, frontend, backend, config, threads, weights, right_delay)
+        check_tracker_arguments(camera, frontend, backend, config, threads, weights, right_delay, imu, odometry)
         self._turn, self._delay, self.config = RLock(), right_delay, (config := config or TrackerConfig())
         networks = config.max_keypoints, backend, threads, provider, weights
         load: Callable[[], Frontend] = partial(build_frontend, frontend, *networks)

@@ -1,6 +1,7 @@
 """Arguments of another type, shape or value give one error of ours that names them and says what to give."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, current_thread
 from typing import Any
@@ -12,7 +13,10 @@ import pytest
 import sigmaslam
 from sigmaslam.bodies.object_tracker import ObjectTracker
 from sigmaslam.errors import FrameError, InputError
+from sigmaslam.estimation.preintegration import preintegrate
 from sigmaslam.frontend import build_frontend
+from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
+from sigmaslam.geometry.odometry_sensor import OdometrySensor
 from sigmaslam.readers import open_sequence
 from sigmaslam.readers.stereo_sequence import StereoFrame
 from sigmaslam.slam import tracker as tracker_module
@@ -166,6 +170,39 @@ def test_wrong_arguments_of_both_trackers_are_refused(demo_sequence: Path, chang
         StereoTracker(**arguments)
     with pytest.raises(InputError, match=words):
         ObjectTracker(region=np.ones((240, 320), bool), **arguments)
+
+
+SENSOR = InertialSensor(np.eye(4), 1e-3, 1e-2, 1e-5, 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"imu": "imu.yaml"}, r"imu is 'imu.yaml': give an InertialSensor, such as read_imu\(path\)"),
+        ({"imu": replace(SENSOR, accel_density=0)}, "imu.accel_density is 0: give the density"),
+        ({"imu": replace(SENSOR, gyro_walk=float("nan"))}, "imu.gyro_walk is nan"),
+        ({"imu": replace(SENSOR, T_left_imu=np.eye(3))}, r"imu.T_left_imu is .*give a rotation with a translation"),
+        ({"imu": replace(SENSOR, T_left_imu=np.diag([1.0, 1.0, -1.0, 1.0]))}, "imu.T_left_imu"),
+        ({"imu": replace(SENSOR, time_shift=float("inf"))}, "imu.time_shift is inf: give seconds"),
+        ({"odometry": "wheels.csv"}, "odometry is 'wheels.csv': give an OdometrySensor"),
+        ({"odometry": OdometrySensor(np.full((4, 4), np.nan))}, "odometry.T_left_base"),
+    ],
+)
+def test_a_wrong_sensor_beside_the_cameras_is_refused(demo_sequence: Path, changed: dict[str, Any], words: str):
+    with pytest.raises(InputError, match=words):
+        StereoTracker(open_sequence(demo_sequence).camera, "klt", **changed)
+
+
+def test_densities_are_numbers_of_any_kind_and_a_gyro_alone_has_none_of_forces(
+    demo_sequence: Path, frames: list[StereoFrame]
+):
+    camera = open_sequence(demo_sequence).camera
+    StereoTracker(camera, "klt", imu=replace(SENSOR, accel_density=np.inf, accel_walk=np.inf, has_accelerometer=False))
+    whole = preintegrate(
+        InertialSamples(np.arange(3.0), np.zeros((3, 3)), np.ones((3, 3))),
+        *(0.0, 2.0, np.zeros(3), np.zeros(3), InertialSensor(np.eye(4), 1, 1, 1, 1), np.ones(2)),
+    )
+    assert np.linalg.eigvalsh(whole.gyro_noise + whole.accel_noise)[0] > 0.0
 
 
 @pytest.mark.parametrize("delay", [10.0, float("nan"), "0.01"])
