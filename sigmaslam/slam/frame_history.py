@@ -115,8 +115,9 @@ class FrameHistory:
         self._intervals: list[_Interval] = []
         self._links: list[MotionLink] = []
         self._began = 0.0
-        # All keyframes and their poses after the last frame.
+        # All keyframes and their poses after the last frame, and by what those are drawn.
         self._ids: list[int] = []
+        self._drawn: list[np.ndarray] = []
         self._state = window.posterior
 
     def append(self, estimate: Estimate, predicted: MotionState, filtered: MotionState) -> None:
@@ -128,8 +129,8 @@ class FrameHistory:
         """
         if not estimate.has_pose:
             return
-        active = self._keyframes.active
-        ids = [keyframe.id for keyframe in (*self._keyframes.remembered, *active)]
+        active, known = self._keyframes.active, [*self._keyframes.remembered, *self._keyframes.active]
+        ids = [keyframe.id for keyframe in known]
         if self._chain and not set(self._ids) & set(ids):
             self._settle()
         if not self._chain:
@@ -144,7 +145,7 @@ class FrameHistory:
             self._links.append(link)
         for gone in [each for each in self._chain if each not in ids]:
             self._forget(gone, ids)
-        self._ids, self._state = ids, published_state(self._window)
+        self._ids, self._state, self._drawn = ids, published_state(self._window), [each.drawn for each in known]
         self._timestamps.append(estimate.timestamp)
 
     def final(self) -> tuple[Trajectory, np.ndarray]:
@@ -233,9 +234,10 @@ class FrameHistory:
         parts = []
         for first, last, interval in zip([places[0], *places], places, self._intervals, strict=False):
             step = se3_inverse(keyframes.poses[first]) @ keyframes.poses[last]
-            parts.append(interval.settled(step).frames.between(first, last, keyframes))
-        parts.append(HangingFrames.at_first(smooth_motion(self._links)).between(places[-1], places[-1], keyframes))
-        return [self._in_left_camera(*part) for part in parts]
+            parts.append((interval.settled(step).frames, first, last))
+        parts.append((HangingFrames.at_first(smooth_motion(self._links)), places[-1], places[-1]))
+        placed = [(frames.between(first, last, keyframes), self._drawn[first]) for frames, first, last in parts]
+        return [self._in_left_camera(poses, covariances + spread) for (poses, covariances), spread in placed]
 
     def _in_left_camera(self, poses: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses of the rectified camera in those of the left one, covariances in the camera's own frame."""

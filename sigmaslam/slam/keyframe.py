@@ -27,7 +27,7 @@ class Keyframe:
         blur: of its image, as of `Keyframes.blur`.
         points: landmarks that it was the anchor of, in its frame, once it has left the window.
         spread: (6, 6) by which its pose is less certain than its views say, perturbed from the left in the world.
-        drawn: (6, 6) likewise, its part of what moves, on which later keyframes rest.
+        drawn: (6, 6) likewise, by what moved, here or where keyframes were made that its pose rests on.
     """
 
     id: int

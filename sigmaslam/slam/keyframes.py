@@ -86,10 +86,15 @@ class Keyframes:
     def append(
         self, view: StereoView, timestamp: float, blur: float = 1.0, landmarks: np.ndarray | slice = slice(None)
     ) -> None:
-        """Takes the newest keyframe of the window, with its blur and which of its features (K,) are landmarks."""
+        """Takes the newest keyframe of the window, with its blur and which of its features (K,) are landmarks.
+
+        It is drawn as the last one, until more is known.
+        """
         energies = np.zeros((len(view.features.keypoints), 2))
         energies[landmarks] = patch_energies(view.left, view.features.keypoints[landmarks])
-        self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur))
+        known = [*self.remembered, *self.active]
+        drawn = known[-1].drawn if known else np.zeros((6, 6))
+        self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, spread=drawn, drawn=drawn))
         self._next_id += 1
 
     def blur(self, left: np.ndarray, seen: LandmarkViews) -> tuple[float, float]:

@@ -33,7 +33,7 @@ _MIN_DISPARITY = 0.5
 
 
 def _in_all_directions(spread: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """A covariance (6, 6) as large in all directions of the camera: where something drew it once is not all it did."""
+    """A covariance (6, 6) with the same traces, alike in all directions of the camera: what moves drew it on since."""
     own = np.diag(turn_covariance(se3_inverse(pose), spread)).reshape(2, 3)
     return turn_covariance(pose, np.diag(np.repeat(own.mean(axis=1), 3)))
 
@@ -155,8 +155,8 @@ class Mapper:
         if matches.after_gap:
             self.window.landmarks.misses[:] = self.config.max_misses
         # What moves draws the pose, hidden by streaks or not: frames that see the keyframe's landmarks share that.
-        drawn = self._of_keyframes("drawn", views) + (matches.streaked or doubts.is_ambiguous) * doubts.spread
-        drawn = _in_all_directions(drawn, fit.pose)
+        drawn = _in_all_directions(self._mean([each.drawn for each in self.keyframes.active], views), fit.pose)
+        drawn = drawn + (matches.streaked or doubts.is_ambiguous) * doubts.spread
         spread = drawn + matches.streaked * (1.0 - 1.0 / fit.clustering) * (fit.relative - self.spread(views))
         tracks = self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
         self.keyframes.active[-1] = replace(self.keyframes.active[-1], drawn=drawn, spread=spread)
@@ -164,13 +164,13 @@ class Mapper:
 
     def spread(self, seen: LandmarkViews) -> np.ndarray:
         """(6, 6) by which a pose is less certain than its views say, as the keyframes of their landmarks are."""
-        return self._of_keyframes("spread", seen)
+        return self._mean([each.spread for each in self.keyframes.active], seen)
 
-    def _of_keyframes(self, name: str, seen: LandmarkViews) -> np.ndarray:
-        """(6, 6) mean of an attribute of keyframes, by what views of their landmarks weigh."""
-        keyframes, weight = self.keyframes.active, 1.0 / np.trace(seen.noise[:, :2, :2], axis1=1, axis2=2)
-        share = np.bincount(self.window.landmarks.anchor[seen.landmark], weight, len(keyframes)) / weight.sum()
-        return np.asarray(np.tensordot(share, [getattr(each, name) for each in keyframes], 1))
+    def _mean(self, spreads: list[np.ndarray], seen: LandmarkViews) -> np.ndarray:
+        """(6, 6) mean of matrices of the window's keyframes, by what views of their landmarks weigh."""
+        weight = 1.0 / np.trace(seen.noise[:, :2, :2], axis1=1, axis2=2)
+        share = np.bincount(self.window.landmarks.anchor[seen.landmark], weight, len(spreads)) / weight.sum()
+        return np.asarray(np.tensordot(share, spreads, 1))
 
     def insert(self, new: NewKeyframe) -> KeyframeTracks:
         """Makes a view a keyframe: what it has in stereo beside the views of known landmarks is new.
@@ -197,6 +197,9 @@ class Mapper:
         index = self._add_landmarks(new.view, views, new.blur)
         slope = disparity_slopes(new.view.features.keypoints, new.view.disparity, index)
         keyframes.append(replace(new.view, slope=slope), new.timestamp, new.blur, index)
+        if new.origin is not None:
+            drawn = keyframes.remembered[new.origin].drawn
+            keyframes.active[-1] = replace(keyframes.active[-1], drawn=drawn, spread=drawn)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()

@@ -19,6 +19,7 @@ from sigmaslam.slam.estimate import CalibrationEstimate, Estimate
 from sigmaslam.slam.eye_timing import EyeTiming
 from sigmaslam.slam.guided_matching import GuidedMatches
 from sigmaslam.slam.inertial_estimate import describe_inertial
+from sigmaslam.slam.keyframes import Keyframes
 from sigmaslam.slam.localisation import Prediction
 from sigmaslam.slam.mapping import KeyframeTracks
 from sigmaslam.slam.relative_poses import RelativePoseReporter
@@ -39,6 +40,7 @@ class Reporter:
 
     rectifier: StereoRectifier
     window: KeyframeWindow
+    keyframes: Keyframes
     motion: MotionFilter
     relative_poses: RelativePoseReporter
     timing: EyeTiming
@@ -62,7 +64,7 @@ class Reporter:
         has_learned = tracks is not None and len(state) == 2 and bool(self.window.causes)
         if fit is not None and not has_learned:
             # Published alone: a prediction as wide as that would find nothing.
-            fit = published_fit(self.window, fit).spread_by(doubts.spread + doubts.by_stamp)
+            fit = published_fit(self.window, fit).spread_by(doubts.spread + doubts.published)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             by_error, offset = fit.joint.common[-6:], float(fit.calibration[0])
             covariance, part = fit.joint.covariance, slice(-6, None)
@@ -70,7 +72,8 @@ class Reporter:
             prediction = Prediction.of(self.window, self.motion)
             covariance, part = state.covariance, pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance if fit is None else fit.relative
-            absolute = covariance[part, part] + prediction.covariance + doubts.spread + doubts.by_stamp
+            absolute = covariance[part, part] + prediction.covariance + doubts.spread + doubts.published
+            absolute = absolute + self.keyframes.active[-1].drawn
             by_error = state.common[part]
             offset = float(state.calibration[0])
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)

@@ -209,14 +209,14 @@ class Scrutiny:
         if is_other or (expects and self._motion.widened > 1.0):
             doubts.add(Doubt.TIME)
             # The pose at the stamp is the prediction, as uncertain as it was before, and the image's is off by a way.
-            doubts.by_stamp = Prediction.of(self._window, self._motion).covariance
+            doubts.published = doubts.published + Prediction.of(self._window, self._motion).covariance
         if self._stop is not None and not is_other:
             # An image that is delivered again, compressed anew, looks like a stop within a frame; so do those after it.
             pose, expected, _, since = self._stop
             if np.nanmedian(seen_apart(self._window, matches.views.landmark, pose, fit.pose)) < ACCEPTANCE.stands:
                 doubts.add(Doubt.TIME)
                 frames = 1.0 + (self._course.tracked_at - since) / self._clock.interval
-                doubts.by_stamp = doubts.by_stamp + frames**2 * expected
+                doubts.published = doubts.published + frames**2 * expected
             else:
                 self._stop = None
         self._last_error = error

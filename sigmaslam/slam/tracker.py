@@ -135,7 +135,7 @@ class StereoTracker:
         origin = None if start is None else start.of_rectified(turned)
         self._recovery = Recovery(course, window, keyframes, motion, self._mapper, admission, config, origin)
         relative = RelativePoseReporter(turned, window, keyframes, motion)
-        self._reporter = Reporter(self.rectifier, window, motion, relative, self._scrutiny.timing)
+        self._reporter = Reporter(self.rectifier, window, keyframes, motion, relative, self._scrutiny.timing)
         self.last_frame: MatchedFrame | None = None
         self._history = FrameHistory(window, keyframes, turned)
 

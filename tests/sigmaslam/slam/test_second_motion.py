@@ -59,7 +59,7 @@ def test_what_moves_makes_a_keyframe_as_uncertain_where_the_stamp_is_doubtful_to
         scrutiny._had_other_times = expects
         found.append(scrutiny.doubt(black(), matches, fit)[2])
     assert [Doubt.TIME in each.reasons for each in found] == [False, True]
-    assert [each.by_stamp.any() for each in found] == [False, True]
+    assert [each.published.any() for each in found] == [False, True]
     assert found[0].spread.any()
     assert np.array_equal(found[0].spread, found[1].spread)
 
