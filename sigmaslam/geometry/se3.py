@@ -6,6 +6,7 @@ Barfoot, "State Estimation for Robotics", chapter 8.
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -119,6 +120,18 @@ def se3_inverse(T: np.ndarray) -> np.ndarray:
 def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (..., 3) in the frame that T (4, 4) takes them to."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def is_rigid(T: Any) -> bool:
+    """Whether it is a rotation with a translation, (4, 4); files have as few as six digits."""
+    try:
+        T = np.asarray(T, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
+        return False
+    R = T[:3, :3]
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0.0)
 
 
 def nearest_rigid(T: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from sigmaslam.bounded_files import TABLE_BYTES, finite_number, read_text, short
 from sigmaslam.errors import CalibrationError, InputError
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
 from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
-from sigmaslam.geometry.se3 import se3_inverse
+from sigmaslam.geometry.se3 import is_rigid, se3_inverse
 
 # A time stamp above this is in nanoseconds: seconds would be of the year 33658.
 _NANOSECONDS_FROM = 1e12
@@ -204,7 +204,6 @@ def _find_mounting(table: Path) -> tuple[np.ndarray, float] | None:
 def read_rigid(content: CalibrationYaml, key: str) -> np.ndarray:
     """A rigid transform (4, 4), in rows or as OpenCV writes matrices."""
     T = content.transform(key)
-    # Files have as few as six digits.
-    if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0.0:
+    if not is_rigid(T):
         raise content.error(f"{key} is no rotation with a translation: {T.tolist()}")
     return T

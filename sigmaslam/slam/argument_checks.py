@@ -14,6 +14,7 @@ from sigmaslam.frontend.types import check_grey
 from sigmaslam.geometry.camera import StereoCamera
 from sigmaslam.geometry.inertial_sensor import InertialSensor
 from sigmaslam.geometry.odometry_sensor import OdometrySensor
+from sigmaslam.geometry.se3 import is_rigid
 from sigmaslam.inference.backends import ONNX, backend_names
 from sigmaslam.slam.config import TrackerConfig
 
@@ -58,8 +59,8 @@ def check_tracker_arguments(
     if imu is not None:
         _check_sensor("imu", imu, InertialSensor, "T_left_imu")
         measured = [name for name in _DENSITIES if imu.has_accelerometer or name.startswith("gyro")]
-        if wrong := [name for name in measured if not 0.0 < getattr(imu, name) < math.inf]:
-            raise _wrong(f"imu.{wrong[0]}", getattr(imu, wrong[0]), "the density of the data sheet, above zero")
+        if wrong := [name for name in measured if not _is_number(value := getattr(imu, name)) or value <= 0.0]:
+            raise _wrong(f"imu.{wrong[0]}", getattr(imu, wrong[0]), "that of the data sheet, above zero")
     if odometry is not None:
         _check_sensor("odometry", odometry, OdometrySensor, "T_left_base")
 
@@ -140,13 +141,16 @@ def check_mask(mask: Any, width: int, height: int) -> None:
 def _check_sensor(name: str, sensor: Any, kind: type[InertialSensor | OdometrySensor], mounting: str) -> None:
     """A sensor beside the cameras: where it is, and its clock."""
     if not isinstance(sensor, kind):
-        raise _wrong(name, sensor, f"an {kind.__name__}, such as read_{name}(path).sensor of sigmaslam.readers")
-    T = np.asarray(getattr(sensor, mounting))
-    is_rigid = T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
-    if not is_rigid or np.linalg.det(T[:3, :3]) < 0.0:
-        raise _wrong(f"{name}.{mounting}", T.tolist(), "a rotation with a translation, (4, 4)")
-    if not math.isfinite(sensor.time_shift):
+        module = f"sigmaslam.readers.{'inertial' if name == 'imu' else name}"
+        raise _wrong(name, sensor, f"an {kind.__name__}, such as read_{name}(Path(...)).sensor of {module}")
+    if not is_rigid(T := getattr(sensor, mounting)):
+        raise _wrong(f"{name}.{mounting}", T, "a rotation with a translation, (4, 4), whose last row is 0 0 0 1")
+    if not _is_number(sensor.time_shift):
         raise _wrong(f"{name}.time_shift", sensor.time_shift, "seconds")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def _wrong(name: str, value: object, expected: str) -> InputError:

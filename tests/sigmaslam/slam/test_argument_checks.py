@@ -178,11 +178,18 @@ SENSOR = InertialSensor(np.eye(4), 1e-3, 1e-2, 1e-5, 1e-4)
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"imu": "imu.yaml"}, r"imu is 'imu.yaml': give an InertialSensor, such as read_imu\(path\)"),
-        ({"imu": replace(SENSOR, accel_density=0)}, "imu.accel_density is 0: give the density"),
+        (
+            {"imu": "imu.yaml"},
+            r"imu is 'imu.yaml': give an InertialSensor, such as read_imu\(Path.* of sigmaslam.readers.inertial",
+        ),
+        ({"imu": replace(SENSOR, accel_density=0)}, "imu.accel_density is 0: give that of the data sheet"),
         ({"imu": replace(SENSOR, gyro_walk=float("nan"))}, "imu.gyro_walk is nan"),
         ({"imu": replace(SENSOR, T_left_imu=np.eye(3))}, r"imu.T_left_imu is .*give a rotation with a translation"),
         ({"imu": replace(SENSOR, T_left_imu=np.diag([1.0, 1.0, -1.0, 1.0]))}, "imu.T_left_imu"),
+        ({"imu": replace(SENSOR, **{"gyro_density": "0.1"})}, "imu.gyro_density is '0.1'"),
+        ({"imu": replace(SENSOR, T_left_imu=np.eye(4) + np.eye(4, k=-3))}, "imu.T_left_imu.*last row is 0 0 0 1"),
+        ({"imu": replace(SENSOR, **{"T_left_imu": [[1.0], [0.0, 1.0]]})}, "imu.T_left_imu"),
+        ({"imu": replace(SENSOR, **{"time_shift": None})}, "imu.time_shift is None"),
         ({"imu": replace(SENSOR, time_shift=float("inf"))}, "imu.time_shift is inf: give seconds"),
         ({"odometry": "wheels.csv"}, "odometry is 'wheels.csv': give an OdometrySensor"),
         ({"odometry": OdometrySensor(np.full((4, 4), np.nan))}, "odometry.T_left_base"),
