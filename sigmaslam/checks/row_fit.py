@@ -97,7 +97,7 @@ def fit_rows(matches: EyeMatches, camera: RectifiedStereo) -> RowFit:
 
 
 def follows_motion(fit: RowFit) -> bool:
-    """Whether rows show its lag, nearly, beside all that stays in its place, as lenses do, and in all pairs alike."""
+    """Whether all pairs show about the same lag, when a bend that stays in the image, as of a lens, is fitted, too."""
     matches, x, y, pairs = fit.matches, fit.unit["roll"], fit.unit["zoom"], np.unique(fit.matches.pair)
     if len(pairs) == 1:
         return False

@@ -131,17 +131,46 @@ def test_a_delay_of_a_few_milliseconds_is_told_in_seconds():
     assert (found["synchronisation"].severity, found["synchronisation"].delay) == ("warning", 0.0)
 
 
-@pytest.mark.parametrize(("lag", "bend", "is_late"), [(0.0, 0.0, False), (0.05, 0.0, True), (0.0, 8.0, False)])
-def test_a_lens_that_looks_like_a_delay_follows_no_motion(lag: float, bend: float, is_late: bool):
-    """What is nearer the further it is from the middle, as a road: rows that a lens bends look like its flow."""
-    matches = matches_of(count=1200, outliers=0.0)
+def ahead(lag: float | np.ndarray = 0.0, bend: float = 0.0, scatter: float = 0.0, pairs: int = 4) -> EyeMatches:
+    """A camera that goes ahead above a road: what is further from the middle is nearer, and a bend looks like its flow.
+
+    The lag is that of all pairs, or of each.
+    """
+    matches, rng = matches_of(count=4800, outliers=0.0), np.random.default_rng(1)
     x, y = ((matches.right - (VIEW.cx, VIEW.cy)) / VIEW.fx).T
-    pair = np.arange(1200) % 4
+    pair = np.arange(4800) % pairs
     flow = ((100.0 + 25.0 * pair) * y**2)[:, None] * np.column_stack([x, y])
-    matches.right[:, 1] += lag * flow[:, 1] + bend * y**3
-    fit = fit_rows(replace(matches, flow=flow, pair=pair), VIEW)
-    assert (abs(fit.lag) > 5.0 * fit.sigmas[4]) == bool(lag or bend)
+    matches.right[:, 1] += np.broadcast_to(lag, pairs)[pair] * flow[:, 1] + bend * y**3
+    matches.right[:, 1] += rng.normal(0.0, scatter, 4800)
+    return replace(matches, flow=flow, pair=pair)
+
+
+@pytest.mark.parametrize(
+    ("matches", "is_late"),
+    [
+        (ahead(), False),
+        (ahead(lag=0.05), True),
+        (ahead(bend=8.0), False),
+        (ahead(lag=0.05, bend=8.0), False),
+        (ahead(lag=np.array([0.1, 0.16, 0.1, 0.1])), False),
+        (ahead(lag=0.05, scatter=0.7), False),
+        (ahead(lag=0.05, pairs=1), False),
+    ],
+    ids=["good", "late", "a lens", "half of it a lens", "not in all pairs", "within the scatter", "one pair"],
+)
+def test_a_delay_follows_the_motion_of_all_pairs_as_no_lens_does(matches: EyeMatches, is_late: bool):
+    fit = fit_rows(matches, VIEW)
     assert follows_motion(fit) == is_late
+
+
+@pytest.mark.parametrize(
+    ("matches", "severity"), [(ahead(lag=0.05, scatter=0.35), "warning"), (ahead(bend=8.0, scatter=0.35), "ok")]
+)
+def test_a_delay_that_explains_a_quarter_of_the_rows_is_told_from_a_lens(matches: EyeMatches, severity: str):
+    fit = fit_rows(matches, VIEW)
+    spread = [np.median(np.abs(rows - np.median(rows))) for rows in (fit.residual, fit.residual + fit.by_lag[:, 1])]
+    assert 1 / 5 < 1.0 - (spread[0] / spread[1]) ** 2 < 1 / 3
+    assert findings_of(matches)["synchronisation"][0] == severity
 
 
 def test_a_bump_between_two_pairs_is_no_delay():
