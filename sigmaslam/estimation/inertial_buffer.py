@@ -33,7 +33,7 @@ class InertialBuffer(SampleBuffer):
             biases: (6,) of gyro and accelerometer.
             densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
         """
-        table = self.around(start - WHILE, end)  # what a gap may have changed by is told by those before
+        table = self.around(start - WHILE, end)  # earlier samples tell how fast they change in gaps
         start, end = start + self.time_shift, end + self.time_shift
         if len(table) < 2 or table[-1, 0] <= start:
             return None
