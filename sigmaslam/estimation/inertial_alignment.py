@@ -43,8 +43,6 @@ _TURN_SHARE, _TURN_ERROR = 0.25, 3e-3
 _GYRO_BIAS_FLOOR = 2e-3
 # Residuals are no white noise: neighbours share landmarks, so that there are about so many times fewer of them.
 _SHARED = 4.0
-# In flight samples are about so many times noisier than a data sheet says, in variances.
-_SAMPLE_NOISE = 25.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +148,7 @@ def _solve(bodies: np.ndarray, motions: Sequence[Preintegrated]) -> tuple[np.nda
     A, by, y = whole[:, :12], whole[:, 12:31], p.ravel() - whole[:, 31]
     # Errors of the samples add up between poses that are far apart in time.
     integrated = np.mean([np.trace(each.accel_noise[POSITION, POSITION]) / 3.0 for each in motions])
-    least = _LEAST_PLACE**2 + _SAMPLE_NOISE * integrated
+    least = _LEAST_PLACE**2 + integrated
     variance, direction = least, np.zeros(3)
     for _ in range(3):  # without gravity's length, with it, and with the residuals' size
         weighted = A.T / variance

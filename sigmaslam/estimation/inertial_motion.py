@@ -146,24 +146,24 @@ class InertialMotion(MotionFilter):
         if not self.is_resting:  # vibrations come with motion
             self.noise.learn(departure, removed)
         gain = regression(P[6:, _POSE], P[_POSE, _POSE])
-        self._move(gain @ departure)
-        others = P[6:, 6:] - gain @ removed @ gain.T
+        change, others = gain @ departure, P[6:, 6:] - gain @ removed @ gain.T
+        if is_excluded:  # by something that is no such error as a described sensor has
+            sensor = slice(_SENSOR.start - 6, None)
+            change[sensor], others[sensor, sensor] = 0.0, P[_SENSOR, _SENSOR]
+        self._move(change)
         self.step = nearest_rigid(step)
         self._covariance = np.block([[covariance, kept @ gain.T], [gain @ kept, 0.5 * (others + others.T)]])
         self._note_twist(self.twist[3:])
         if self._time is not None:
             recent = self.samples.around(self._time - WHILE, self._time)
             pose, spread = self._T_first_key @ self.step, se3_body(self.step, covariance)
-            self._standstill.see(self._time, pose, spread, recent, self.noise.scale)
+            self._standstill.see(self._time, pose, spread, recent, self.noise.scale * self.samples.spectra)
             if self._wheels is not None:
                 self._wheels.compare(self._time, self.twist, float(self._densities[0]))
         self._is_dark = False
         if self._contradictions == _CONTRADICTIONS:
             _LOGGER.warning("images contradict the inertial sensor: constant velocity until gravity is found anew")
             self._leave(np.full(3, np.sqrt(self._densities[0])))
-            # As the sensor was described.
-            self.noise, self.samples.time_shift = LearnedNoise(), self.samples.sensor.time_shift
-            self._T_camera_imu, self.samples.factors = self._mounting, np.zeros((2, 3, 3))
 
     def start_keyframe(self) -> None:
         """The current pose is the keyframe's from now on: velocity and gravity turn into its frame."""
@@ -230,11 +230,13 @@ class InertialMotion(MotionFilter):
                 self._measure(residual, slope, noise)
 
     def _leave(self, sigma: np.ndarray) -> None:
-        """Constant velocity again, known to (3,) m/s, until gravity is found anew."""
+        """Constant velocity again, known to (3,) m/s, until gravity is found anew by the sensor as it was described."""
         pose = self.step_covariance.copy()
         self.is_inertial, self._covariance, self._contradictions = False, np.zeros((12, 12)), 0
         self._covariance[_POSE, _POSE] = pose
         self.set_twist(self.twist, np.r_[sigma, np.full(3, self._densities[1])])
+        self.noise, self.samples.time_shift = LearnedNoise(), self.samples.sensor.time_shift
+        self._T_camera_imu, self.samples.factors = self._mounting, np.zeros((2, 3, 3))
 
     def _note_twist(self, rate: np.ndarray) -> None:
         """The camera's twist in its own frame, at that angular rate (3,)."""

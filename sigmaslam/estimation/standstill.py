@@ -11,8 +11,9 @@ from sigmaslam.geometry.se3 import se3_inverse, se3_log
 
 # Seconds for which nothing may move, and the least number of samples in them that a variance can be told from.
 WHILE, _LEAST_SAMPLES = 0.5, 10
-# The variance of samples at rest is at most so many times the expected one: twice the standard deviation.
-_QUIET = 4.0
+# The variance of samples at rest is at most so many times the expected one: twice the standard deviation. That is at
+# most so many times the data sheet's: what shakes more may fly.
+_QUIET, _LARGEST = 4.0, 25.0
 # A jump of the force is a blow where it is so many times the usual one, and so large, m/s^2. In 105 s of a flight
 # (EuRoC V1 01) the largest one of 50 ms is at most 5.6 times the usual one.
 _UNUSUAL, _LEAST_BLOW = 8.0, 5.0
@@ -38,7 +39,7 @@ class Standstill:
         self._is_seen, self._glides = False, False
 
     def see(
-        self, timestamp: float, pose: np.ndarray, covariance: np.ndarray, samples: np.ndarray, scale: np.ndarray
+        self, timestamp: float, pose: np.ndarray, covariance: np.ndarray, samples: np.ndarray, noise: np.ndarray
     ) -> None:
         """Takes a pose by images.
 
@@ -47,7 +48,7 @@ class Standstill:
             pose: (4, 4) of the camera in any frame that stays.
             covariance: (6, 6) of it in its own frame.
             samples: (N, 7) of the sensor in the last half second.
-            scale: (2,) by which its noise is larger than the data sheet says, in variances.
+            noise: (2,) spectra of gyro and accelerometer in that time, as of white noise.
         """
         self._poses.append((timestamp, pose, covariance))
         while len(self._poses) > 1 and self._poses[1][0] <= timestamp - WHILE:
@@ -59,7 +60,8 @@ class Standstill:
         departure, spread = se3_log(se3_inverse(before) @ pose), spread + covariance
         self.speed_variance = spread[:3, :3] / (timestamp - since) ** 2
         stays, spectrum = squared_mahalanobis(departure, spread) < CHI_SQUARE_95[6], _spectrum(samples)
-        quiet = bool((spectrum < _QUIET * np.repeat(scale, 3) * self._sheet).all())
+        expected = np.minimum(np.repeat(noise, 3), _LARGEST * self._sheet)
+        quiet = bool((spectrum < _QUIET * expected).all())
         self._is_seen, self._glides = bool(stays) and quiet, quiet and not stays
         if self._is_seen:
             self.spectra = np.maximum(spectrum, self._sheet)
