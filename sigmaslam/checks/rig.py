@@ -28,8 +28,8 @@ _WARN_LAG = 0.5
 # Many matches share it: far places, which are most, hide what near ones show.
 _LEAST_LAG = 0.05
 # And one that explains a smaller share of the variance of rows than this may stand for something else; the lesser one
-# suffices where nothing but the motion looks like it.
-_LAG_SHARE, _LESSER_SHARE = 1 / 3, 1 / 5
+# suffices where nothing but the motion looks like it, for more of a frame than what other faults of a rig look like.
+_LAG_SHARE, _LESSER_SHARE, _LEAST_FRAMES = 1 / 3, 1 / 5, 0.03
 # Rows in the stored images agree within this if these are rectified already, pixels.
 _RECTIFIED_ROWS = 0.5
 _SYNCHRONISATION = "synchronisation"
@@ -173,7 +173,9 @@ def _check_synchronisation(fit: RowFit, frame_interval: float | None) -> Finding
     sigma = float(fit.sigmas[4])
     figure = f"{abs(fit.lag):.2f} ± {sigma:.2f} of a frame{_milliseconds(fit.lag, frame_interval)}"
     explained = 1.0 - _mad(fit.residual) ** 2 / max(_mad(fit.residual + fit.by_lag[:, 1]) ** 2, 1e-12)
-    is_late = explained > _LAG_SHARE or (explained > _LESSER_SHARE and follows_motion(fit))
+    is_late = explained > _LAG_SHARE or (
+        explained > _LESSER_SHARE and abs(fit.lag) > _LEAST_FRAMES and follows_motion(fit)
+    )
     if fit.lag_shift < _LEAST_LAG or not is_late:
         return Finding(_SYNCHRONISATION, "ok", f"the eyes are {figure} apart", fit.lag)
     message = (

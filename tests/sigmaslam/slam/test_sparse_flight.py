@@ -20,8 +20,11 @@ from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covaria
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sensor", "most_ate", "least_near"), [("none", 0.033, 0), ("inertial", 0.036, 44)])
-def test_every_image_is_found(real_data, monkeypatch, sensor, most_ate, least_near):
+@pytest.mark.parametrize(
+    ("sensor", "most_ate", "least_near", "least_sure"), [("none", 0.024, 0, 59), ("inertial", 0.025, 46, 58)]
+)
+def test_every_image_is_found(real_data, monkeypatch, sensor, most_ate, least_near, least_sure):
+    """With the sensor one is `ambiguous` or none, by chance of the samples' noise: 42 matches are all there is."""
     anywhere, find_anywhere = [], Localiser._localise_anywhere
 
     def search_anywhere(*args):
@@ -45,7 +48,8 @@ def test_every_image_is_found(real_data, monkeypatch, sensor, most_ate, least_ne
         if predicts:
             near.append(not anywhere)
         keyframes.append(estimates[-1].tracks is not None)
-    assert [each.status for each in estimates[1:]] == ["tracking"] * 59
+    assert all(each.has_pose for each in estimates)
+    assert [each.status for each in estimates[1:]].count("tracking") >= least_sure
     found = Trajectory(np.array([e.timestamp for e in estimates]), np.array([e.T_world_camera for e in estimates]))
     here, there = associate(found, read_trajectory(folder / "groundtruth.csv"))
     assert len(here) == 60
