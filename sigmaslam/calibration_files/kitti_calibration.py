@@ -19,7 +19,7 @@ from sigmaslam.calibration_files.lens_models import (
 from sigmaslam.errors import CalibrationError
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.checked_yaml import CalibrationYaml
-from sigmaslam.geometry.se3 import rigid_motion
+from sigmaslam.geometry.se3 import is_rigid, rigid_motion
 
 GREY_PAIR = (0, 1)
 
@@ -64,8 +64,7 @@ def read_rigid(path: Path, rotation: str, translation: str) -> np.ndarray:
     """
     content = _read_entries(path, GREY_PAIR)
     T = rigid_motion(_matrix(content, rotation, (3, 3)), _matrix(content, translation, (3,)))
-    # The files have seven digits.
-    if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+    if not is_rigid(T):
         raise CalibrationError(f"{path}: key '{rotation}' is no rotation; correct the numbers")
     return T
 

@@ -128,7 +128,7 @@ def is_rigid(T: Any) -> bool:
         T = np.asarray(T, dtype=float)
     except (TypeError, ValueError):
         return False
-    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0], atol=1e-9):
         return False
     R = T[:3, :3]
     return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0.0)

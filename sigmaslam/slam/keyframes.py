@@ -84,17 +84,22 @@ class Keyframes:
         return [known[id] for id in sorted(known) if id < recent]
 
     def append(
-        self, view: StereoView, timestamp: float, blur: float = 1.0, landmarks: np.ndarray | slice = slice(None)
+        self,
+        view: StereoView,
+        timestamp: float,
+        blur: float = 1.0,
+        landmarks: np.ndarray | slice = slice(None),
+        less_certain: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         """Takes the newest keyframe of the window, with its blur and which of its features (K,) are landmarks.
 
-        It is drawn as the last one, until more is known.
+        `less_certain` are its `spread` and `drawn`: as the last keyframe is drawn unless given.
         """
         energies = np.zeros((len(view.features.keypoints), 2))
         energies[landmarks] = patch_energies(view.left, view.features.keypoints[landmarks])
         known = [*self.remembered, *self.active]
-        drawn = known[-1].drawn if known else np.zeros((6, 6))
-        self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, spread=drawn, drawn=drawn))
+        spread, drawn = less_certain or 2 * (known[-1].drawn if known else np.zeros((6, 6)),)
+        self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, spread=spread, drawn=drawn))
         self._next_id += 1
 
     def blur(self, left: np.ndarray, seen: LandmarkViews) -> tuple[float, float]:

@@ -67,6 +67,7 @@ class NewKeyframe:
         origin: of the first one, the past pose relative to which `step_covariance` is.
         blur: of its image, as of `Keyframes.blur`.
         rig_changed: the disparity offset is as unknown as at the start.
+        less_certain: as of `Keyframes.append`; with an `origin` as that is drawn unless given.
     """
 
     view: StereoView
@@ -78,6 +79,7 @@ class NewKeyframe:
     origin: int | None = None
     blur: float = 1.0
     rig_changed: bool = False
+    less_certain: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(slots=True)
@@ -158,9 +160,10 @@ class Mapper:
         drawn = _in_all_directions(self._mean([each.drawn for each in self.keyframes.active], views), fit.pose)
         drawn = drawn + (matches.streaked or doubts.is_ambiguous) * doubts.spread
         spread = drawn + matches.streaked * (1.0 - 1.0 / fit.clustering) * (fit.relative - self.spread(views))
-        tracks = self.insert(NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur))
-        self.keyframes.active[-1] = replace(self.keyframes.active[-1], drawn=drawn, spread=spread)
-        return tracks
+        less_certain = spread, drawn
+        return self.insert(
+            NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur, less_certain=less_certain)
+        )
 
     def spread(self, seen: LandmarkViews) -> np.ndarray:
         """(6, 6) by which a pose is less certain than its views say, as the keyframes of their landmarks are."""
@@ -196,10 +199,10 @@ class Mapper:
         window.add_views(views)
         index = self._add_landmarks(new.view, views, new.blur)
         slope = disparity_slopes(new.view.features.keypoints, new.view.disparity, index)
-        keyframes.append(replace(new.view, slope=slope), new.timestamp, new.blur, index)
-        if new.origin is not None:
-            drawn = keyframes.remembered[new.origin].drawn
-            keyframes.active[-1] = replace(keyframes.active[-1], drawn=drawn, spread=drawn)
+        less_certain = new.less_certain
+        if less_certain is None and new.origin is not None:
+            less_certain = 2 * (keyframes.remembered[new.origin].drawn,)
+        keyframes.append(replace(new.view, slope=slope), new.timestamp, new.blur, index, less_certain)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()
