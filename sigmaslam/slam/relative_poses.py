@@ -68,13 +68,14 @@ class RelativePoseReporter:
         # Of the keyframes that poses can be related to: (K,) place behind each other, time stamp, path length.
         self._index, self._times, self._lengths = np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
 
-    def report(self, timestamp: float, state: WindowState, fit: FrameFit | None) -> RelativePoses:
+    def report(self, timestamp: float, state: WindowState, fit: FrameFit | None, spread: np.ndarray) -> RelativePoses:
         """Relates a frame to the keyframes nearest to each span, if they are near.
 
         Args:
             timestamp: of the frame, seconds.
             state: of the window, with poses, as it is published.
             fit: its fit to that; None: the last keyframe moved on, be it the frame itself or a prediction.
+            spread: (6, 6) by which doubts make the frame's pose less certain, which a fit knows already.
         """
         self._note_keyframes()
         prediction = Prediction.of(self._window, self._motion)
@@ -86,7 +87,7 @@ class RelativePoseReporter:
         index = self._index[chosen]
         if fit is None:
             earlier, covariance = last_relative_to(state, index)
-            covariance = covariance + prediction.covariance
+            covariance = covariance + prediction.covariance + spread
         else:
             earlier, covariance = frame_relative_to(state, fit.joint, index)
             # What the fit was inflated by is the frame's alone.

@@ -60,11 +60,12 @@ class Reporter:
         state = published_state(self.window)
         if not len(state):
             return self._report_nothing(timestamp, status, milliseconds)
+        doubted = doubts.spread + doubts.published
         # What is wrong is found by the second keyframe: its own pose knew nothing of it.
         has_learned = tracks is not None and len(state) == 2 and bool(self.window.causes)
         if fit is not None and not has_learned:
             # Published alone: a prediction as wide as that would find nothing.
-            fit = published_fit(self.window, fit).spread_by(doubts.spread + doubts.published)
+            fit = published_fit(self.window, fit).spread_by(doubted)
             pose, absolute, relative = fit.pose, fit.covariance, fit.relative
             by_error, offset = fit.joint.common[-6:], float(fit.calibration[0])
             covariance, part = fit.joint.covariance, slice(-6, None)
@@ -72,8 +73,7 @@ class Reporter:
             prediction = Prediction.of(self.window, self.motion)
             covariance, part = state.covariance, pose_slice(len(state) - 1)
             pose, relative = prediction.pose, prediction.covariance if fit is None else fit.relative
-            absolute = covariance[part, part] + prediction.covariance + doubts.spread + doubts.published
-            absolute = absolute + self.keyframes.active[-1].drawn
+            absolute = covariance[part, part] + prediction.covariance + doubted + self.keyframes.active[-1].drawn
             by_error = state.common[part]
             offset = float(state.calibration[0])
         pose, shift = self.window.held_offset.place(pose, offset, covariance, part)
@@ -106,7 +106,7 @@ class Reporter:
             by_calibration=by_error,
             tracks=tracks,
             # A keyframe is the window's by now, which has learned from it.
-            relative_poses=self.relative_poses.report(timestamp, state, fit if tracks is None else None),
+            relative_poses=self.relative_poses.report(timestamp, state, fit if tracks is None else None, doubted),
             doubts=tuple(doubts.reasons),
             loop=loop,
             inertial=describe_inertial(self.motion, T_rectified_left[:3, :3], T_world_camera),

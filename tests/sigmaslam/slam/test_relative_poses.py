@@ -9,6 +9,7 @@ import pytest
 
 from sigmaslam.geometry.se3 import se3_inverse, se3_log
 from sigmaslam.slam.relative_poses import DISTANCES, DURATIONS, SPANS, RelativePoses
+from sigmaslam.slam.scrutiny import Scrutiny
 from sigmaslam.slam.tracker import StereoTracker
 from tests.support.quantiles import squared_sigmas
 from tests.support.simulated_frontend import SCALES, SimulatedFrontend, SimulatedRun, run_simulated
@@ -109,6 +110,29 @@ def test_a_lost_frame_is_related_with_the_uncertainty_of_its_prediction():
     for span in common:
         sharp, vague = (np.trace(each.covariance[each.span == span][0][:3, :3]) for each in (before, after))
         assert vague > sharp
+
+
+@pytest.mark.long
+def test_what_may_have_drawn_a_pose_is_in_it_at_keyframes_too(monkeypatch: pytest.MonkeyPatch):
+    spread, doubt = 0.5**2 * np.eye(6), Scrutiny.doubt
+
+    def doubt_last(self, frame, matches, fit):
+        matches, fit, doubts = doubt(self, frame, matches, fit)
+        doubts.add_motion(fit.pose, fit.pose, spread)
+        return matches, fit, doubts
+
+    sure = simulate("driving", 0, 60)
+    monkeypatch.setattr(Scrutiny, "doubt", doubt_last)
+    frontend = SimulatedFrontend(SCALES["driving"], 0, 60, 100)
+    run = run_simulated(StereoTracker(frontend.camera, frontend), frontend, SCALES["driving"])
+    seen = {True: 0, False: 0}
+    for plain, doubted in zip(sure.estimates, run.estimates, strict=True):
+        for covariance in doubted.relative_poses.covariance:
+            assert np.linalg.eigvalsh(covariance)[-1] > 0.5**2
+            seen[doubted.tracks is not None] += 1
+        assert all(np.linalg.eigvalsh(each)[-1] < 0.4**2 for each in plain.relative_poses.covariance)
+    assert seen[True] > 1
+    assert seen[False] > 20
 
 
 def test_before_there_is_a_keyframe_there_is_nothing():
