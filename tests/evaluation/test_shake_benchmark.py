@@ -173,7 +173,7 @@ def test_what_was_found_is_kept_until_the_code_changes(tmp_path: Path, monkeypat
     judged = []
     monkeypatch.setattr(shake, "judge", lambda source, method: judged.append(source.name) or GOOD)
     page = shake.write_shake(tmp_path / "page.md", tmp_path / "runs", 4, 1, "the command")
-    assert judged == ["room1000"] * 2 + ["room1001"] * 2 + ["drone1002"] * 2 + ["drone1003"] * 2
+    assert judged == ["room43000"] * 2 + ["room43001"] * 2 + ["drone43002"] * 2 + ["drone43003"] * 2
     assert "All goals are met." in page
     assert "480" in page
     assert shake.write_shake(tmp_path / "page.md", tmp_path / "runs", 4, 1, "the command") == page
