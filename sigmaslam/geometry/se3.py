@@ -123,12 +123,12 @@ def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def is_rigid(T: Any) -> bool:
-    """Whether it is a rotation with a translation, (4, 4); files have as few as six digits."""
+    """Whether it is a rotation, to the six digits that files have, with a translation; (4, 4)."""
     try:
         T = np.asarray(T, dtype=float)
     except (TypeError, ValueError):
         return False
-    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0], atol=1e-9):
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], np.eye(4)[3], rtol=0.0, atol=1e-9):
         return False
     R = T[:3, :3]
     return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0.0)

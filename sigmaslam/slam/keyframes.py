@@ -89,16 +89,16 @@ class Keyframes:
         timestamp: float,
         blur: float = 1.0,
         landmarks: np.ndarray | slice = slice(None),
-        less_certain: tuple[np.ndarray, np.ndarray] | None = None,
+        spreads: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         """Takes the newest keyframe of the window, with its blur and which of its features (K,) are landmarks.
 
-        `less_certain` are its `spread` and `drawn`: as the last keyframe is drawn unless given.
+        `spreads` are its `spread` and `drawn`: as the last keyframe is drawn unless given.
         """
         energies = np.zeros((len(view.features.keypoints), 2))
         energies[landmarks] = patch_energies(view.left, view.features.keypoints[landmarks])
         known = [*self.remembered, *self.active]
-        spread, drawn = less_certain or 2 * (known[-1].drawn if known else np.zeros((6, 6)),)
+        spread, drawn = spreads or 2 * (known[-1].drawn if known else np.zeros((6, 6)),)
         self.active.append(Keyframe(self._next_id, timestamp, view, energies, blur, spread=spread, drawn=drawn))
         self._next_id += 1
 

@@ -67,7 +67,7 @@ class NewKeyframe:
         origin: of the first one, the past pose relative to which `step_covariance` is.
         blur: of its image, as of `Keyframes.blur`.
         rig_changed: the disparity offset is as unknown as at the start.
-        less_certain: as of `Keyframes.append`; with an `origin` as that is drawn unless given.
+        spreads: as of `Keyframes.append`; with an `origin` as that is drawn unless given.
     """
 
     view: StereoView
@@ -79,7 +79,7 @@ class NewKeyframe:
     origin: int | None = None
     blur: float = 1.0
     rig_changed: bool = False
-    less_certain: tuple[np.ndarray, np.ndarray] | None = None
+    spreads: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(slots=True)
@@ -160,9 +160,9 @@ class Mapper:
         drawn = _in_all_directions(self._mean([each.drawn for each in self.keyframes.active], views), fit.pose)
         drawn = drawn + (matches.streaked or doubts.is_ambiguous) * doubts.spread
         spread = drawn + matches.streaked * (1.0 - 1.0 / fit.clustering) * (fit.relative - self.spread(views))
-        less_certain = spread, drawn
+        spreads = spread, drawn
         return self.insert(
-            NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur, less_certain=less_certain)
+            NewKeyframe(admitted, timestamp, fit.pose, step, covariance, views, blur=blur, spreads=spreads)
         )
 
     def spread(self, seen: LandmarkViews) -> np.ndarray:
@@ -199,10 +199,10 @@ class Mapper:
         window.add_views(views)
         index = self._add_landmarks(new.view, views, new.blur)
         slope = disparity_slopes(new.view.features.keypoints, new.view.disparity, index)
-        less_certain = new.less_certain
-        if less_certain is None and new.origin is not None:
-            less_certain = 2 * (keyframes.remembered[new.origin].drawn,)
-        keyframes.append(replace(new.view, slope=slope), new.timestamp, new.blur, index, less_certain)
+        spreads = new.spreads
+        if spreads is None and new.origin is not None:
+            spreads = 2 * (keyframes.remembered[new.origin].drawn,)
+        keyframes.append(replace(new.view, slope=slope), new.timestamp, new.blur, index, spreads)
         seen = LandmarkViews.concatenate([views, window.landmarks.anchor_views(len(window) - 1)])
         window.solve()
         self.motion.start_keyframe()
