@@ -4,6 +4,7 @@ from dataclasses import replace
 from math import comb
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sigmaslam.estimation.gaussian import regression
 from sigmaslam.estimation.preintegration import Preintegrated, preintegrate
@@ -14,10 +15,11 @@ from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
 # A frame changes what is learned by this share, however surprising its pose. Small departures show no small noise:
 # images are better than they claim.
 _ADAPTATION, _MOST_SURPRISE = 0.05, 3.0
-# So many times the densities' variance is no noise any more but another fault.
+# So many times the variance that samples show is no noise any more but another fault.
 _LARGEST_SCALE = 1e4
-# Of the differences that tell noise.
-_ORDER = 6
+# Order of the differences that tell noise, of means of so many samples, and how many they are at least; with fewer data
+# sheets are taken to be off by five times.
+_ORDER, _MEANS_OF, _LEAST_BENDS, _UNKNOWN = 6, (1, 2, 3), 6, 25.0
 
 
 class InertialBuffer(SampleBuffer):
@@ -57,20 +59,24 @@ class InertialBuffer(SampleBuffer):
 def noise_spectra(samples: np.ndarray, sensor: InertialSensor) -> np.ndarray:
     """(2,) power spectra of gyro and accelerometer as of white noise: a data sheet's, which hold at rest, or more.
 
-    By sixth differences of the means of two samples (N, 7). Motions hardly have any; what rotors do to successive
-    samples cancels in such means, as it does in motions: errors of these in flight (EuRoC V1 01) are 7 and 10 to 17
-    times those by the data sheet, the root of this 4 and 15 times it, on a bench (MH01) 1.0 and 1.2.
+    The least that sixth differences of samples (N, 7), and of means of two and three, show. White noise is the same in
+    all; motions are hardly in the finest and tones of rotors not in all, as little of either is noise of a motion.
+    Errors of these in flight (EuRoC V1 01) are 7 and 10 to 17 times those by the data sheet, the root of this 4 and 14
+    times it; unpowered (MH01) 1.0.
     """
     sheet = np.square([sensor.gyro_density, sensor.accel_density])
-    means = 0.5 * (samples[0 : len(samples) - 1 : 2] + samples[1::2])
-    steps = np.diff(means[:, 0])
-    if len(steps) < _ORDER:
-        return sheet
-    even = np.lib.stride_tricks.sliding_window_view(steps, _ORDER).max(axis=1) < 1.5 * np.median(steps)
-    bends = np.diff(means[:, 1:], _ORDER, axis=0)[even].reshape(-1, 2, 3)
-    if not len(bends):
-        return sheet
-    return np.maximum(np.median(steps) * np.mean(bends**2, axis=(0, 2)) / comb(2 * _ORDER, _ORDER), sheet)
+    found = []
+    for count in _MEANS_OF:
+        means = samples[: len(samples) // count * count].reshape(-1, count, 7).mean(axis=1)
+        if len(means) < _ORDER + _LEAST_BENDS:
+            continue
+        steps = np.diff(means[:, 0])
+        even = sliding_window_view(steps, _ORDER).max(axis=1) < 1.5 * np.median(steps)
+        bends = np.diff(means[:, 1:], _ORDER, axis=0)[even]
+        if len(bends) >= _LEAST_BENDS:
+            variances = np.mean(bends.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / comb(2 * _ORDER, _ORDER)
+            found.append(np.median(steps) * variances)
+    return np.maximum(np.min(found, axis=0), sheet) if found else _UNKNOWN * sheet
 
 
 class LearnedNoise:

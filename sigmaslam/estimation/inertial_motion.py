@@ -147,7 +147,7 @@ class InertialMotion(MotionFilter):
             self.noise.learn(departure, removed)
         gain = regression(P[6:, _POSE], P[_POSE, _POSE])
         change, others = gain @ departure, P[6:, 6:] - gain @ removed @ gain.T
-        if is_excluded:  # by something that is no such error as a described sensor has
+        if self._contradictions > _CONTRADICTIONS // 2:  # by something that is no such error as a sensor has, as it is described
             sensor = slice(_SENSOR.start - 6, None)
             change[sensor], others[sensor, sensor] = 0.0, P[_SENSOR, _SENSOR]
         self._move(change)
@@ -230,13 +230,17 @@ class InertialMotion(MotionFilter):
                 self._measure(residual, slope, noise)
 
     def _leave(self, sigma: np.ndarray) -> None:
-        """Constant velocity again, known to (3,) m/s, until gravity is found anew by the sensor as it was described."""
-        pose = self.step_covariance.copy()
+        """Constant velocity again, known to (3,) m/s, until gravity is found anew.
+
+        A sensor that images contradict counts as it was described.
+        """
+        pose, is_wrong = self.step_covariance.copy(), self._contradictions > 0
         self.is_inertial, self._covariance, self._contradictions = False, np.zeros((12, 12)), 0
         self._covariance[_POSE, _POSE] = pose
         self.set_twist(self.twist, np.r_[sigma, np.full(3, self._densities[1])])
-        self.noise, self.samples.time_shift = LearnedNoise(), self.samples.sensor.time_shift
-        self._T_camera_imu, self.samples.factors = self._mounting, np.zeros((2, 3, 3))
+        if is_wrong:
+            self.noise, self.samples.time_shift = LearnedNoise(), self.samples.sensor.time_shift
+            self._T_camera_imu, self.samples.factors = self._mounting, np.zeros((2, 3, 3))
 
     def _note_twist(self, rate: np.ndarray) -> None:
         """The camera's twist in its own frame, at that angular rate (3,)."""

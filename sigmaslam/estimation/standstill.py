@@ -11,9 +11,9 @@ from sigmaslam.geometry.se3 import se3_inverse, se3_log
 
 # Seconds for which nothing may move, and the least number of samples in them that a variance can be told from.
 WHILE, _LEAST_SAMPLES = 0.5, 10
-# The variance of samples at rest is at most so many times the expected one: twice the standard deviation. That is at
-# most so many times the data sheet's: what shakes more may fly.
-_QUIET, _LARGEST = 4.0, 25.0
+# The variance of samples at rest is at most so many times the expected one: twice the standard deviation. That is
+# between so many times the data sheet's: engines idle, at tones that no noise has, and what shakes more may fly.
+_QUIET, _LEAST, _LARGEST = 4.0, 9.0, 25.0
 # A jump of the force is a blow where it is so many times the usual one, and so large, m/s^2. In 105 s of a flight
 # (EuRoC V1 01) the largest one of 50 ms is at most 5.6 times the usual one.
 _UNUSUAL, _LEAST_BLOW = 8.0, 5.0
@@ -60,7 +60,7 @@ class Standstill:
         departure, spread = se3_log(se3_inverse(before) @ pose), spread + covariance
         self.speed_variance = spread[:3, :3] / (timestamp - since) ** 2
         stays, spectrum = squared_mahalanobis(departure, spread) < CHI_SQUARE_95[6], _spectrum(samples)
-        expected = np.minimum(np.repeat(noise, 3), _LARGEST * self._sheet)
+        expected = np.clip(np.repeat(noise, 3), _LEAST * self._sheet, _LARGEST * self._sheet)
         quiet = bool((spectrum < _QUIET * expected).all())
         self._is_seen, self._glides = bool(stays) and quiet, quiet and not stays
         if self._is_seen:

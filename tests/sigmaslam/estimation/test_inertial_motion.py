@@ -167,7 +167,19 @@ def test_noise_is_what_successive_samples_do_not_share():
         samples = np.column_stack([t, swing + white])
         for table in (samples, np.delete(samples, range(80, 120), axis=0)):
             np.testing.assert_allclose(noise_spectra(table, SENSOR) / sheet, expected, rtol=0.25)
-    np.testing.assert_array_equal(noise_spectra(samples[:2], SENSOR), sheet)
+    np.testing.assert_array_equal(noise_spectra(samples[:2], SENSOR), 25.0 * sheet)
+
+
+def test_an_idling_engine_is_at_rest():
+    """Its tones are no noise of the sensor."""
+    flight = Flight(1, Motion(1, size=0.0), noise=1.0)
+    t, gyro, accel = flight.samples.columns()
+    tone = np.sin(2.0 * np.pi * 13.0 * t)[:, None] * [1.0, -0.5, 0.5]
+    flight.samples = InertialSamples(t, gyro + 0.005 * tone, accel + 0.15 * tone)
+    for dark in (False, True):
+        flight.fly(40, dark=dark)
+        assert flight.filter.is_resting
+    assert np.linalg.norm(flight.filter.step[:3, 3]) < 0.01
 
 
 def test_at_rest_gravity_is_found_as_well():
