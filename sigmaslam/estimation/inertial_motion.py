@@ -147,9 +147,7 @@ class InertialMotion(MotionFilter):
             self.noise.learn(departure, removed)
         gain = regression(P[6:, _POSE], P[_POSE, _POSE])
         change, others = gain @ departure, P[6:, 6:] - gain @ removed @ gain.T
-        if (
-            self._contradictions > _CONTRADICTIONS // 2
-        ):  # by something that is no such error as a sensor has, as it is described
+        if self._contradictions > _CONTRADICTIONS // 2:  # by no such error as a sensor has, as it is described
             sensor = slice(_SENSOR.start - 6, None)
             change[sensor], others[sensor, sensor] = 0.0, P[_SENSOR, _SENSOR]
         self._move(change)
