@@ -60,7 +60,7 @@ def noise_spectra(samples: np.ndarray, sensor: InertialSensor) -> np.ndarray:
     """(2,) power spectra of gyro and accelerometer as of white noise: a data sheet's, which hold at rest, or more.
 
     The least that sixth differences of samples (N, 7), and of means of two and three, show. White noise is the same in
-    all; motions are hardly in the finest and tones of rotors not in all, as little of either is noise of a motion.
+    all; motions are hardly in the finest, tones of rotors not in all, and neither is noise that a motion has.
     Errors of these in flight (EuRoC V1 01) are 7 and 10 to 17 times those by the data sheet, the root of this 4 and 14
     times it; unpowered (MH01) 1.0.
     """
