@@ -65,18 +65,18 @@ def noise_spectra(samples: np.ndarray, sensor: InertialSensor) -> np.ndarray:
     times it; unpowered (MH01) 1.0.
     """
     sheet = np.square([sensor.gyro_density, sensor.accel_density])
-    found = []
+    least = np.full(2, np.inf)
     for count in _MEANS_OF:
         means = samples[: len(samples) // count * count].reshape(-1, count, 7).mean(axis=1)
-        if len(means) < _ORDER + _LEAST_BENDS:
-            continue
+        if (least <= sheet).all() or len(means) < _ORDER + _LEAST_BENDS:
+            break
         steps = np.diff(means[:, 0])
         even = sliding_window_view(steps, _ORDER).max(axis=1) < 1.5 * np.median(steps)
         bends = np.diff(means[:, 1:], _ORDER, axis=0)[even]
         if len(bends) >= _LEAST_BENDS:
             variances = np.mean(bends.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / comb(2 * _ORDER, _ORDER)
-            found.append(np.median(steps) * variances)
-    return np.maximum(np.min(found, axis=0), sheet) if found else _UNKNOWN * sheet
+            least = np.minimum(least, np.median(steps) * variances)
+    return np.where(np.isfinite(least), np.maximum(least, sheet), _UNKNOWN * sheet)
 
 
 class LearnedNoise:
