@@ -20,11 +20,8 @@ from sigmaslam_evaluation.metrics.truth_covariance import relative_truth_covaria
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("sensor", "most_ate", "least_near", "least_sure"), [("none", 0.024, 0, 59), ("inertial", 0.025, 46, 58)]
-)
-def test_every_image_is_found(real_data, monkeypatch, sensor, most_ate, least_near, least_sure):
-    """With the sensor one is `ambiguous` or none, by chance of the samples' noise: 42 matches are all there is."""
+@pytest.mark.parametrize(("sensor", "most_ate", "least_near"), [("none", 0.024, 0), ("inertial", 0.025, 46)])
+def test_every_image_is_found(real_data, monkeypatch, sensor, most_ate, least_near):
     anywhere, find_anywhere = [], Localiser._localise_anywhere
 
     def search_anywhere(*args):
@@ -49,7 +46,6 @@ def test_every_image_is_found(real_data, monkeypatch, sensor, most_ate, least_ne
             near.append(not anywhere)
         keyframes.append(estimates[-1].tracks is not None)
     assert all(each.has_pose for each in estimates)
-    assert [each.status for each in estimates[1:]].count("tracking") >= least_sure
     found = Trajectory(np.array([e.timestamp for e in estimates]), np.array([e.T_world_camera for e in estimates]))
     here, there = associate(found, read_trajectory(folder / "groundtruth.csv"))
     assert len(here) == 60
@@ -71,3 +67,7 @@ def test_every_image_is_found(real_data, monkeypatch, sensor, most_ate, least_ne
     assert ate < most_ate
     assert np.mean(nees) <= 1.5
     assert sum(near) >= least_near
+    statuses = [each.status for each in estimates[1:]]
+    if sensor == "inertial" and sorted(statuses) == ["ambiguous", *["tracking"] * 58]:
+        pytest.xfail("by chance of the samples' noise one image, after a keyframe of 42 matches, is ambiguous")
+    assert statuses == ["tracking"] * 59
