@@ -169,10 +169,11 @@ def reconstruct_run(
     seconds = time.perf_counter() - began
     assert cloud is not None
     points = cloud.cloud(least_views(keyframes.count) if min_views is None else min_views)
-    if max_sigma is not None:
-        points = points.select(points.sigma <= max_sigma)
-    if not len(points.points):
-        raise InputError("no point is left: give a smaller --min-views or a larger --max-sigma")
+    if not len(points):
+        raise InputError("no point is left: give a smaller --min-views")
+    if max_sigma is not None and max_sigma < (least := float(points.sigma.min())):
+        raise InputError(f"--max-sigma is {max_sigma:g} m, and no point is known to less than {least:.2g} m")
+    points = points.select(points.sigma <= (max_sigma or np.inf))
     write_cloud(out, points)
     if posed is not None:
         posed.write(points)

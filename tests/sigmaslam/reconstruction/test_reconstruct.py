@@ -68,6 +68,8 @@ def test_every_second_keyframe_certain_points_and_poses_for_others(tracked: Path
         "reconstruct", tracked / "again", "--out", tracked / "none.ply", "--every", "2", "--min-views", "900"
     )
     assert_refused(none, "no point is left: give a smaller --min-views")
+    none = run_here("reconstruct", tracked / "again", "--out", tracked / "none.ply", "--max-sigma", "1e-6")
+    assert_refused(none, "--max-sigma is 1e-06 m, and no point is known to less than 0.0")
     assert not (tracked / "none.ply").exists()
     summary = json.loads((tracked / "again" / "reconstruction.json").read_text())
     assert summary["keyframes"] == -(-keyframes.count // 2)
