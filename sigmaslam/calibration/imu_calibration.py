@@ -203,7 +203,7 @@ def _integrate(
     for (start, end), bias in zip(pairwise(times.tolist()), biases, strict=False):
         first, last = np.searchsorted(samples.timestamp, [start, end])
         near = samples.select(np.arange(max(first - 2, 0), min(last + 2, len(samples))))
-        motions.append(preintegrate(near, start, end, bias[:3], bias[3:], sensor, _UNKNOWN))
+        motions.append(preintegrate(near, start, end, bias[:3], bias[3:], sensor.spectra, _UNKNOWN))
     return motions
 
 

@@ -225,11 +225,8 @@ class GravitySearch:
         if found is None:
             self._complain(time, "forces do not fit the path, or it tells too little; are unit (m/s^2) and axes right?")
             return None
-        way = np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
-        _LOGGER.info(
-            "gravity is known to %.1f degrees, from %.1f s of images along %.2f m",
-            *(np.degrees(_tilt(found.covariance)), time - times[0], way),
-        )
+        tilt, way = np.degrees(_tilt(found.covariance)), np.linalg.norm(np.diff(bodies[:, :3, 3], axis=0), axis=1).sum()
+        _LOGGER.info("gravity is known to %.1f degrees, from %.1f s of images along %.2f m", tilt, seconds, way)
         return replace(found, biases=np.r_[bias, np.zeros(3)] + found.biases)
 
     def _complain(self, time: float, cause: str) -> None:

@@ -1,6 +1,5 @@
 """Inertial samples between images as relative motions, and what their noise turns out to be."""
 
-from dataclasses import replace
 from math import comb
 
 import numpy as np
@@ -32,7 +31,7 @@ class InertialBuffer(SampleBuffer):
     def __init__(self, sensor: InertialSensor) -> None:
         super().__init__(sensor.time_shift)
         self.sensor, self.factors = sensor, np.zeros((2, 3, 3))
-        self.spectra = np.square([sensor.gyro_density, sensor.accel_density])
+        self.spectra = sensor.spectra
 
     def preintegrate(self, start: float, end: float, biases: np.ndarray, densities: np.ndarray) -> Preintegrated | None:
         """The motion between two time stamps of the camera; None without samples near them.
@@ -47,24 +46,21 @@ class InertialBuffer(SampleBuffer):
         start, end = start + self.time_shift, end + self.time_shift
         if len(table) < 2 or table[-1, 0] <= start:
             return None
-        self.spectra = noise_spectra(table, self.sensor)
-        gyro_density, accel_density = np.sqrt(self.spectra).tolist()
-        sensor = replace(self.sensor, gyro_density=gyro_density, accel_density=accel_density)
+        self.spectra = noise_spectra(table, self.sensor.spectra)
         measured = (table[:, 1:] - biases).reshape(-1, 2, 3).transpose(1, 0, 2)
         gyro, accel = measured - measured @ self.factors.transpose(0, 2, 1)
         samples, zero = InertialSamples(table[:, 0], gyro, accel), np.zeros(3)
-        return preintegrate(samples, start, end, zero, zero, sensor, densities)
+        return preintegrate(samples, start, end, zero, zero, self.spectra, densities)
 
 
-def noise_spectra(samples: np.ndarray, sensor: InertialSensor) -> np.ndarray:
-    """(2,) power spectra of gyro and accelerometer as of white noise: a data sheet's, which hold at rest, or more.
+def noise_spectra(samples: np.ndarray, sheet: np.ndarray) -> np.ndarray:
+    """(2,) power spectra of gyro and accelerometer as of white noise: a data `sheet`'s, which hold at rest, or more.
 
     The least that sixth differences of samples (N, 7), and of means of two and three, show. White noise is the same in
     all; motions are hardly in the finest, tones of rotors not in all, and neither is noise that a motion has.
     Errors of these in flight (EuRoC V1 01) are 7 and 10 to 17 times those by the data sheet, the root of this 4 and 14
     times it; unpowered (MH01) 1.0.
     """
-    sheet = np.square([sensor.gyro_density, sensor.accel_density])
     least = np.full(2, np.inf)
     for count in _MEANS_OF:
         means = samples[: len(samples) // count * count].reshape(-1, count, 7).mean(axis=1)

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from sigmaslam.estimation.inertial_turns import rotation_products
-from sigmaslam.geometry.inertial_sensor import InertialSamples, InertialSensor
+from sigmaslam.geometry.inertial_sensor import InertialSamples
 from sigmaslam.geometry.se3 import rotation_exp, skew
 
 # Order of the errors of a preintegrated motion.
@@ -63,7 +63,7 @@ def preintegrate(
     end: float,
     gyro_bias: np.ndarray,
     accel_bias: np.ndarray,
-    sensor: InertialSensor,
+    noise: np.ndarray,
     densities: np.ndarray,
 ) -> Preintegrated:
     """Integrates samples from `start` to `end`, seconds of the sensor's clock.
@@ -74,6 +74,7 @@ def preintegrate(
     Args:
         samples: at least one; those around the interval, too.
         gyro_bias, accel_bias: (3,) taken off.
+        noise: (2,) power spectra of gyro and accelerometer, rad^2/s and m^2/s^3, as of white noise.
         densities: (2,) power spectra of unknown accelerations, m^2/s^3 and rad^2/s^3, for gaps.
     """
     t = samples.timestamp
@@ -91,7 +92,7 @@ def preintegrate(
     is_gap = gaps > _GAP * period
     is_bridged = is_gap & (gaps <= _BRIDGED) & ~before_first & ~behind_last
     is_missing = is_gap & ~is_bridged
-    spectra = np.tile(np.square([sensor.gyro_density, sensor.accel_density], dtype=float), (len(steps), 1))
+    spectra = np.tile(noise, (len(steps), 1))
     for k in np.flatnonzero(is_bridged):
         spectra[k] += [bridge_spectrum(t, values, gaps[k]).mean() for values in (samples.gyro, samples.accel)]
     # A rate that goes from end to end with an unknown angular acceleration, as a Brownian bridge.

@@ -32,7 +32,7 @@ class Standstill:
     """
 
     def __init__(self, sensor: InertialSensor) -> None:
-        self._sheet = np.repeat([sensor.gyro_density, sensor.accel_density], 3) ** 2
+        self._sheet = np.repeat(sensor.spectra, 3)
         self.spectra = self._sheet
         self._poses: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
         self.speed_variance = np.eye(3)

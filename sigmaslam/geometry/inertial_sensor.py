@@ -30,6 +30,11 @@ class InertialSensor:
     time_shift: float = 0.0
     has_accelerometer: bool = True
 
+    @property
+    def spectra(self) -> np.ndarray:
+        """(2,) power spectra of the white noise of gyro and accelerometer, rad^2/s and m^2/s^3."""
+        return np.square([self.gyro_density, self.accel_density], dtype=float)
+
 
 @dataclass(frozen=True, slots=True)
 class InertialSamples(Table):

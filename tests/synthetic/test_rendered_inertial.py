@@ -82,7 +82,7 @@ def test_integrated_samples_are_the_splines_motion_with_the_second_power_of_the_
     R, place, s = T[:, :3, :3], T[:, :3, 3], end - start
     for rate in (100, 200, 400, 800):
         samples, _ = measure_exactly(walk, MOUNTING, np.arange(1.9, 3.2, 1 / rate))
-        found = preintegrate(samples, start, end, np.zeros(3), np.zeros(3), sensor, np.ones(2))
+        found = preintegrate(samples, start, end, np.zeros(3), np.zeros(3), sensor.spectra, np.ones(2))
         position = R[0].T @ (place[1] - place[0] - speed[0] * s - 0.5 * GRAVITY * s * s)
         velocity = R[0].T @ (speed[1] - speed[0] - GRAVITY * s)
         turn = rotation_log(R[0].T @ R[1] @ found.turn.T)

@@ -199,10 +199,10 @@ def test_derivatives_of_the_inertial_residual():
         moved = state.moved(step[:30].reshape(2, 15), step[30:])
         ends = 0.3 + moved.shift, 0.4 + moved.shift
         bias = moved.biases[0]
-        motion = preintegrate(recorded.samples, *ends, bias[:3], bias[3:], SENSOR, np.ones(2))
+        motion = preintegrate(recorded.samples, *ends, bias[:3], bias[3:], SENSOR.spectra, np.ones(2))
         return _inertial(moved, 0, motion)[0]
 
-    motion = preintegrate(recorded.samples, 0.32, 0.42, np.zeros(3), np.zeros(3), SENSOR, np.ones(2))
+    motion = preintegrate(recorded.samples, 0.32, 0.42, np.zeros(3), np.zeros(3), SENSOR.spectra, np.ones(2))
     _, J, K, border = _inertial(state, 0, motion)
     h = 1e-6 * np.eye(40)
     numeric = np.stack([(residual(step) - residual(-step)) / 2e-6 for step in h], axis=1)

@@ -22,7 +22,7 @@ def align_noisy(seed: int, force: float = 1.0) -> tuple[Alignment | None, np.nda
     sigma = np.repeat([2e-3, 5e-4], 3)
     poses = np.array([se3_exp(sigma * rng.normal(size=6)) @ pose for pose in motion.poses(TIMES)])
     motions = [
-        preintegrate(samples, start, end, np.zeros(3), np.zeros(3), SENSOR, np.zeros(2))
+        preintegrate(samples, start, end, np.zeros(3), np.zeros(3), SENSOR.spectra, np.zeros(2))
         for start, end in pairwise(TIMES)
     ]
     assert all(motions)
@@ -32,7 +32,9 @@ def align_noisy(seed: int, force: float = 1.0) -> tuple[Alignment | None, np.nda
 def test_errors_of_the_sensor_move_gravity_as_the_slope_says():
     motion = Motion(3, size=0.1)
     samples = motion.measure(np.arange(-0.02, 1.2, 0.005))
-    motions = [preintegrate(samples, *span, np.zeros(3), np.zeros(3), SENSOR, np.zeros(2)) for span in pairwise(TIMES)]
+    motions = [
+        preintegrate(samples, *span, np.zeros(3), np.zeros(3), SENSOR.spectra, np.zeros(2)) for span in pairwise(TIMES)
+    ]
     bodies, step = motion.poses(TIMES), 1e-4
     slope = _solve(bodies, motions)[3]
     for k in range(19):
@@ -67,7 +69,8 @@ def test_forces_of_the_wrong_sign_are_told_by_the_path(speed: float):
         for sign in (1.0, -1.0):
             samples = InertialSamples(exact.timestamp, exact.gyro, sign * exact.accel)
             motions = [
-                preintegrate(samples, *span, np.zeros(3), np.zeros(3), SENSOR, np.zeros(2)) for span in pairwise(TIMES)
+                preintegrate(samples, *span, np.zeros(3), np.zeros(3), SENSOR.spectra, np.zeros(2))
+                for span in pairwise(TIMES)
             ]
             found.append(has_wrong_sign(poses, motions))
         assert found == [False, speed > 0.0]

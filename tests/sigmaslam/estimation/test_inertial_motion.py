@@ -160,14 +160,14 @@ def test_images_that_are_better_than_they_claim_do_not_make_the_sensor_certain()
 def test_noise_is_what_successive_samples_do_not_share():
     """At least the data sheet's; a swing of 1 Hz and a gap add nothing."""
     t, rng = np.arange(0.0, 1.0, 0.005), np.random.default_rng(0)
-    sheet = np.square([SENSOR.gyro_density, SENSOR.accel_density])
+    sheet = SENSOR.spectra
     swing = np.sin(2.0 * np.pi * t)[:, None] * [0.5, 0.0, -0.5, 1.0, 2.0, 0.0]
     for scale, expected in ((0.0, 1.0), (1.0, 1.0), (10.0, 100.0)):
         white = scale * np.repeat(np.sqrt(sheet / 0.005), 3) * rng.normal(size=(len(t), 6))
         samples = np.column_stack([t, swing + white])
         for table in (samples, np.delete(samples, range(80, 120), axis=0)):
-            np.testing.assert_allclose(noise_spectra(table, SENSOR) / sheet, expected, rtol=0.25)
-    np.testing.assert_array_equal(noise_spectra(samples[:2], SENSOR), 25.0 * sheet)
+            np.testing.assert_allclose(noise_spectra(table, sheet) / sheet, expected, rtol=0.25)
+    np.testing.assert_array_equal(noise_spectra(samples[:2], sheet), 25.0 * sheet)
 
 
 def test_an_idling_engine_is_at_rest():

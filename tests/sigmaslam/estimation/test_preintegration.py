@@ -12,7 +12,7 @@ NONE = np.zeros(3)
 
 
 def integrate(samples: InertialSamples, start: float, end: float, gyro=NONE, accel=NONE) -> Preintegrated:
-    return preintegrate(samples, start, end, gyro, accel, SENSOR, DENSITIES)
+    return preintegrate(samples, start, end, gyro, accel, SENSOR.spectra, DENSITIES)
 
 
 def errors(motion: Motion, found: Preintegrated, start: float) -> np.ndarray:

@@ -207,7 +207,7 @@ def test_densities_are_numbers_of_any_kind_and_a_gyro_alone_has_none_of_forces(
     StereoTracker(camera, "klt", imu=replace(SENSOR, accel_density=np.inf, accel_walk=np.inf, has_accelerometer=False))
     whole = preintegrate(
         InertialSamples(np.arange(3.0), np.zeros((3, 3)), np.ones((3, 3))),
-        *(0.0, 2.0, np.zeros(3), np.zeros(3), InertialSensor(np.eye(4), 1, 1, 1, 1), np.ones(2)),
+        *(0.0, 2.0, np.zeros(3), np.zeros(3), InertialSensor(np.eye(4), 1, 1, 1, 1).spectra, np.ones(2)),
     )
     assert np.linalg.eigvalsh(whole.gyro_noise + whole.accel_noise)[0] > 0.0
 
