@@ -81,9 +81,7 @@ def describe_age(page: Path, root: Path = ROOT) -> str:
     Args:
         page: Markdown of the repository `root`, made by a command.
     """
-    named = re.search(r"\bat commit ([0-9a-f]{7,})", page.read_text(encoding="utf-8"))
-    commit = named[1] if named else _git(root, "log", "-1", "--format=%h", "--", str(page))
-    name = page.relative_to(root).as_posix()
+    commit, name = _commit_of(page, root), page.relative_to(root).as_posix()
     try:
         days = (time.time() - int(_git(root, "show", "--no-patch", "--format=%ct", commit))) / 86400
         changed = set(_git(root, "diff", "--name-only", commit).splitlines())
@@ -92,6 +90,20 @@ def describe_age(page: Path, root: Path = ROOT) -> str:
     measured = {path.relative_to(root).as_posix() for path in _measured(command_of(page), root)}
     stale = len(changed & measured)
     return f"{name}: commit {commit}, {days:.0f} days, {stale} of {len(measured)} files that it measures changed since"
+
+
+def days_behind(page: Path, root: Path = ROOT) -> float:
+    """How many days passed from the commit that a page was made at to the last change of what it measures."""
+    made = _commit_of(page, root)
+    files = map(str, _measured(command_of(page), root))
+    changed = _git(root, "log", "-1", "--format=%ct", f"{made}..", "--", *files)
+    return (int(changed) - int(_git(root, "show", "--no-patch", "--format=%ct", made))) / 86400 if changed else 0.0
+
+
+def _commit_of(page: Path, root: Path) -> str:
+    """The one that a page says it was made at, else the one that last changed it."""
+    named = re.search(r"\bat commit ([0-9a-f]{7,})", page.read_text(encoding="utf-8"))
+    return named[1] if named else _git(root, "log", "-1", "--format=%h", "--", str(page))
 
 
 def _measured(words: list[str], root: Path) -> list[Path]:

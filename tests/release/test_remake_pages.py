@@ -1,15 +1,20 @@
 """`make results` knows every page that a command makes, and says by name what it leaves out."""
 
+import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from release import remake_pages
-from release.remake_pages import PEERS, ROOT, absent, command_of, describe_age, remake, runnable
+from release.remake_pages import PEERS, ROOT, absent, command_of, days_behind, describe_age, remake, runnable
 from sigmaslam_benchmarks.commands import BENCHMARKS, reads_data
 from sigmaslam_benchmarks.filters import peer_filters
+
+# Code may be so much newer than a page of its figures.
+_DAYS = 14.0
 
 
 def write(folder: Path, name: str, command: str) -> Path:
@@ -107,9 +112,11 @@ def test_renders_go_where_git_does_not_see_them():
 def test_a_page_that_is_older_than_what_it_measures_is_told(tmp_path: Path):
     """One command that is no benchmark: it depends on all code."""
 
-    def git(*words: str) -> str:
+    def git(*words: str, date: str = "2026-01-01T00:00:00Z") -> str:
         user = ["-c", "user.name=a", "-c", "user.email=a@b"]
-        return subprocess.run(["git", *user, *words], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+        dated = {**os.environ, "GIT_COMMITTER_DATE": date}
+        run = partial(subprocess.run, cwd=tmp_path, env=dated, capture_output=True, text=True, check=True)
+        return str(run(["git", *user, *words]).stdout)
 
     git("init", "--quiet")
     code = tmp_path / "sigmaslam" / "tracker.py"
@@ -119,11 +126,24 @@ def test_a_page_that_is_older_than_what_it_measures_is_told(tmp_path: Path):
     git("commit", "--quiet", "--message", "code")
     page = tmp_path / "page.md"
     page.write_text(f"Made by `python -m tests.faults` at commit {git('rev-parse', '--short=7', 'HEAD')}.")
-    assert "0 days, 0 of 1 files" in describe_age(page, tmp_path)
+    assert " days, 0 of 1 files" in describe_age(page, tmp_path)
+    assert days_behind(page, tmp_path) == 0.0
     code.write_text("one = 2\n")
-    assert "0 days, 1 of 1 files" in describe_age(page, tmp_path)
+    assert " days, 1 of 1 files" in describe_age(page, tmp_path)
+    git("commit", "--quiet", "--all", "--message", "changed", date="2026-01-04T12:00:00Z")
+    assert days_behind(page, tmp_path) == 3.5
     page.write_text("Made by `python -m tests.faults` at commit 1234567.")
     assert describe_age(page, tmp_path) == "page.md: of commit 1234567, which is not in this history"
+
+
+@pytest.mark.long
+def test_no_page_is_two_weeks_older_than_what_it_measures():
+    """Figures hold for a while: one page takes minutes to an hour, all of them hours."""
+    if not (ROOT / ".git").exists() or (ROOT / ".git" / "shallow").exists():
+        pytest.skip("needs the history")
+    pages = [page for page in (ROOT / "docs").rglob("*.md") if command_of(page)]
+    behind = {page.name: days for page in pages if (days := days_behind(page)) > _DAYS}
+    assert not behind, "make them anew: make results PAGES=docs/..."
 
 
 def test_the_benchmarks_can_be_imported_before_the_command_line():
