@@ -57,7 +57,7 @@ def write_report(run_dir: str | Path, out: Path | None = None) -> Path:
     """
     folder = Path(run_dir)
     run = read_run(folder)
-    scene, pictures = build_scene(run), _pictures(run)
+    scene, pictures, path = build_scene(run), _pictures(run), out or folder / REPORT_NAME
     state, (head, rows) = report_facts.judge(run), report_facts.list_evaluation(run)
     page = {
         "intervals": _intervals(run.frames),
@@ -67,7 +67,7 @@ def write_report(run_dir: str | Path, out: Path | None = None) -> Path:
         "picture_magnification": PICTURE_MAGNIFICATION,
     }
     return write_page(
-        out or folder / REPORT_NAME,
+        path,
         "report.html",
         [run.frames.seconds],
         build_plots(run),
@@ -90,7 +90,7 @@ def write_report(run_dir: str | Path, out: Path | None = None) -> Path:
         nees_verdict=run.evaluation.get("nees_verdict"),
         refinement=report_facts.list_refinement(run),
         machine=report_facts.list_machine(run),
-        links=[(name, words) for name, words in _LINKED if out is None and (folder / name).is_file()],
+        links=[each for each in _LINKED if path.parent.resolve() == folder.resolve() and (folder / each[0]).is_file()],
         configuration=_configuration(run.entries),
     )
 

@@ -56,6 +56,9 @@ def test_page_of_a_run_may_stand_elsewhere_without_links_to_its_files(tmp_path):
     report([tmp_path / "run"], tmp_path / "page.html")
     assert all(link.startswith("data:") for link in Page((tmp_path / "page.html").read_text(encoding="utf-8")).links)
     assert not (tmp_path / "run/report.html").exists()
+    report([tmp_path / "run"], tmp_path / "run/again.html")
+    links = Page((tmp_path / "run/again.html").read_text(encoding="utf-8")).links
+    assert {link for link in links if not link.startswith("data:")} >= {"frames.csv"}
 
 
 def test_report_says_what_the_run_was(tmp_path):
