@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from sigmaslam.geometry.calibration_covariance import CalibrationCovariance
-from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.slam.estimate import CalibrationEstimate
 
 
@@ -26,11 +26,10 @@ def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, foca
     offset = learned.disparity_offset / focal_length - yaw
     right = replace(camera.right, fx=zoom * camera.right.fx, fy=zoom * camera.right.fy)
     right = replace(right, cx=right.cx - offset * right.fx, cy=right.cy + learned.raised)
-    if "lenses" in shares and right.distortion_model != "equidistant":
-        first, *others = right.distortion or (0.0,) * 4
-        right = replace(right, distortion_model="radtan", distortion=(first - shares["lenses"], *others))
-    left_alone = "lenses" if right.distortion_model == "equidistant" else ""
-    variances = {name: sigma**2 for name, (_, _, sigma) in learned.causes.items() if name != left_alone}
+    both = shares.get("lens", 0.0)
+    left, right = _bent(camera.left, both), _bent(right, both - shares.get("lenses", 0.0))
+    left_alone = ("lens", "lenses") if right.distortion_model == "equidistant" else ()
+    variances = {name: sigma**2 for name, (_, _, sigma) in learned.causes.items() if name not in left_alone}
     variances["offset"] = (learned.disparity_offset_sigma / focal_length) ** 2
     T_left_right = camera.T_left_right.copy()
     T_left_right[:3, :3] = T_left_right[:3, :3] @ cv2.Rodrigues(np.array([0.0, yaw, 0.0]))[0]
@@ -43,4 +42,14 @@ def learned_calibration(camera: StereoCamera, learned: CalibrationEstimate, foca
     names = (*(known.names[k] for k in kept), *variances)
     matrix = np.diag(np.r_[np.zeros(len(kept)), list(variances.values())])
     matrix[: len(kept), : len(kept)] = known.matrix[np.ix_(kept, kept)]
-    return replace(camera, right=right, T_left_right=T_left_right, covariance=CalibrationCovariance(names, matrix))
+    return replace(
+        camera, left=left, right=right, T_left_right=T_left_right, covariance=CalibrationCovariance(names, matrix)
+    )
+
+
+def _bent(eye: CameraModel, k1: float) -> CameraModel:
+    """The camera with so much more radial distortion; as it is if it has another kind."""
+    if k1 == 0.0 or eye.distortion_model == "equidistant":
+        return eye
+    first, *others = eye.distortion or (0.0,) * 4
+    return replace(eye, distortion_model="radtan", distortion=(first + k1, *others))

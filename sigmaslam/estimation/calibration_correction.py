@@ -48,7 +48,8 @@ def foresee(
 ) -> bool:
     """Whether a frame, which knows the offset far better than the window, has another one, or is sure of what is wrong.
 
-    What it finds is foreseen until a keyframe comes, as the frame has it that was surest.
+    What it finds beyond four sigmas is foreseen until a keyframe comes, as the frame has it that was surest: one image
+    of a scene that grows is sure of a lens within three.
 
     Args:
         step, step_covariance: as of `KeyframeWindow.add_keyframe`.
@@ -61,7 +62,8 @@ def foresee(
     poses = se3_exp(joint.step[CALIBRATION_SIZE:-6].reshape(-1, 6)) @ known.poses
     about = replace(known, calibration=fit.calibration, poses=np.concatenate([poses, fit.pose[None]]))
     found = window.evidence.weigh_frame(about, step, step_covariance, joint.information / growth, joint.score / growth)
-    new = {name: cause for name, cause in found.items() if name not in window.causes}
+    credible = {k: each for k, each in found.items() if each.mean**2 > _CREDIBLE**2 * each.variance}
+    new = {k: each for k, each in credible.items() if k not in window.causes}
     for name, cause in new.items():
         window.foreseen[name] = max(window.foreseen.get(name, cause), cause, key=lambda each: each.probability)
     is_sure = any(cause.probability > 1.0 - HOPELESS for cause in new.values())

@@ -44,6 +44,7 @@ HYPOTHESES = {
     "yaw": ("offset", "yaw"),
     "zoom": ("zoom",),  # one focal length
     "lenses": ("lenses",),  # radial distortion of one lens
+    "lens": ("lens",),  # of both, alike
 }
 """What each moves of the tracker's errors, all alike.
 

@@ -23,6 +23,7 @@ _CAUSES = {
     "yaw": ("the right camera is turned about the vertical, by", 180.0 / np.pi, "degrees"),
     "zoom": ("the focal length of one camera is wrong, by", 100.0, "%"),
     "lenses": ("the radial distortion of one lens is wrong, k1 by", 1.0, ""),
+    "lens": ("the radial distortion of both lenses is wrong, k1 by", 1.0, ""),
 }
 # Findings about the rig, which the disparity offset has its share of.
 _RIG = frozenset({"eyes", "mirrored", "rig", "distortion", "rows", "rotation", "scale", "infinity"})

@@ -93,3 +93,18 @@ def test_what_is_wrong_by_the_evidence_is_corrected(name: str):
     assert left[0] < 0.1 * np.abs(errors[:7]).max()
     sigmas = dict(zip(learned.covariance.names, np.sqrt(np.diag(learned.covariance.matrix)), strict=True))
     assert sigmas == {name: pytest.approx(1e-4), "offset": pytest.approx(0.01 / focal)}
+
+
+def test_a_lens_that_is_wrong_in_both_eyes_is_corrected_in_both():
+    true = rectified_pair()
+    left, right = (
+        replace(eye, distortion_model="radtan", distortion=(0.01, 0.0, 0.0, 0.0)) for eye in (true.left, true.right)
+    )
+    given = replace(true, left=left, right=right)
+    focal, errors, k = StereoRectifier(given).rectified.fx, nearest_errors(given, true), ERRORS.index("lens")
+    learned = learned_calibration(
+        given, CalibrationEstimate(0.0, 0.01, {}, {"lens": (1.0, float(errors[k]) / focal, 1e-4)}), focal
+    )
+    assert abs(nearest_errors(learned, true)[k]) < 0.1 * abs(errors[k])
+    assert learned.left.distortion == learned.right.distortion
+    assert learned.covariance.names == ("lens", "offset")
