@@ -27,6 +27,7 @@ CAMERA = StereoCamera(EYE, EYE, np.array([[1.0, 0, 0, 0.2], [0, 1, 0, 0], [0, 0,
         ("zoom_0.5", {"zoom": 2.5}),
         ("baseline_1", {"baseline": -0.01}),
         ("k1_0.01", {"lenses": 5.0}),
+        ("both_k1_0.01", {"lens": -5.0}),
         ("delay_5", {}),
     ],
 )

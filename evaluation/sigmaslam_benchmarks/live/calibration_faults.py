@@ -11,7 +11,7 @@ import numpy as np
 
 from sigmaslam.calibration.tracker_covariance import compared_places, measured_places
 from sigmaslam.estimation.calibration_errors import ERRORS, measured_errors
-from sigmaslam.geometry.camera import StereoCamera
+from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, Fault, delay_right
 
@@ -63,9 +63,17 @@ def stretch_baseline(share: float, camera: StereoCamera) -> StereoCamera:
 
 def bend_right(k1: float, camera: StereoCamera) -> StereoCamera:
     """The right lens is given with so much more radial distortion."""
-    first, *others = camera.right.distortion or (0.0,) * 4
-    right = replace(camera.right, distortion_model="radtan", distortion=(first + k1, *others))
-    return replace(camera, right=right)
+    return replace(camera, right=_bent(camera.right, k1))
+
+
+def bend_both(k1: float, camera: StereoCamera) -> StereoCamera:
+    """Both lenses are."""
+    return replace(camera, left=_bent(camera.left, k1), right=_bent(camera.right, k1))
+
+
+def _bent(eye: CameraModel, k1: float) -> CameraModel:
+    first, *others = eye.distortion or (0.0,) * 4
+    return replace(eye, distortion_model="radtan", distortion=(first + k1, *others))
 
 
 def _sizes(name: str, words: str, change: Any, sizes: dict[str, Any]) -> dict[str, Fault]:
@@ -110,6 +118,7 @@ CALIBRATION_FAULTS: dict[str, Fault] = {
     **_sizes("mixture", "drawn mixture {} of cx, cy, pitch, yaw, roll, zoom", mix, {f"{k}": k for k in range(1, 9)}),
     **_sizes("baseline", "baseline {} % too long", stretch_baseline, {"0.5": 0.005, "1": 0.01, "2": 0.02}),
     **_sizes("k1", "k1 of the right lens {} too large", bend_right, {"0.005": 0.005, "0.01": 0.01, "0.02": 0.02}),
+    **_sizes("both_k1", "k1 of both lenses {} too large", bend_both, {"0.01": 0.01, "0.02": 0.02, "0.05": 0.05}),
     **{
         f"delay_{time}": Fault(f"right images {time} ms late, by optical flow", partial(delay_right, time))
         for time in (2, 5, 10)
