@@ -48,8 +48,8 @@ def foresee(
 ) -> bool:
     """Whether a frame, which knows the offset far better than the window, has another one, or is sure of what is wrong.
 
-    What it finds beyond four sigmas is foreseen until a keyframe comes, as the frame has it that was surest: one image
-    of a scene that grows is sure of a lens within three.
+    What it finds is foreseen until a keyframe comes, as the frame has it that was surest; a lens of both eyes beyond
+    four sigmas alone, as one image of a scene that grows is sure of one within three.
 
     Args:
         step, step_covariance: as of `KeyframeWindow.add_keyframe`.
@@ -62,7 +62,7 @@ def foresee(
     poses = se3_exp(joint.step[CALIBRATION_SIZE:-6].reshape(-1, 6)) @ known.poses
     about = replace(known, calibration=fit.calibration, poses=np.concatenate([poses, fit.pose[None]]))
     found = window.evidence.weigh_frame(about, step, step_covariance, joint.information / growth, joint.score / growth)
-    credible = {k: each for k, each in found.items() if each.mean**2 > _CREDIBLE**2 * each.variance}
+    credible = {k: each for k, each in found.items() if k != "lens" or each.mean**2 > _CREDIBLE**2 * each.variance}
     new = {k: each for k, each in credible.items() if k not in window.causes}
     for name, cause in new.items():
         window.foreseen[name] = max(window.foreseen.get(name, cause), cause, key=lambda each: each.probability)
@@ -91,15 +91,15 @@ def _correct_calibration(window: "KeyframeWindow") -> None:
     """Moves considered errors to what images show of all of them together, and widens those that causes move.
 
     One error alone would stand for others, too. The disparity offset is estimated anyway; it is expected where a yaw
-    has it.
+    has it. A mean that creeps from keyframe to keyframe is off by as much as it moved, at least.
     """
-    window.causes, window.foreseen = window.evidence.weigh(), {}
+    before, window.causes, window.foreseen = window.causes, window.evidence.weigh(), {}
     window.expected = window.evidence.expected.copy()
     means, window.worse = window.evidence.beside(window.causes)
     spreads = np.zeros(len(ERRORS))
     for name, cause in window.causes.items():
-        of_cause = cause.probability * cause.mean
-        spread = cause.probability * (cause.variance + cause.mean**2) - of_cause**2
+        of_cause, moved = cause.probability * cause.mean, cause.mean - before.get(name, cause).mean
+        spread = cause.probability * (cause.variance + moved**2 + cause.mean**2) - of_cause**2
         spreads[ERRORS.index(name)] = np.sqrt(spread)
         if name != "offset" and "offset" in HYPOTHESES[name]:
             window.expected[0] += of_cause

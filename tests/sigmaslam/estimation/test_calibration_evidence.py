@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from sigmaslam.estimation.calibration_correction import change_rig
+from sigmaslam.estimation.calibration_correction import change_rig, judge_calibration
 from sigmaslam.estimation.calibration_errors import ERRORS, SHOWN, TURNS, CalibrationPrior
 from sigmaslam.estimation.calibration_evidence import _ALIKE, _PATIENCE, _WORSE, HYPOTHESES, CalibrationEvidence, Cause
 from sigmaslam.estimation.window_state import WindowState
@@ -175,6 +175,14 @@ def test_a_window_takes_over_what_evidence_names(name: str):
     assert wrong.posterior.calibration[k] == pytest.approx(6.0, abs=3.0 * sigma)
     assert sigma < 1.5
     assert wrong.calibration.sigma[k] == pytest.approx(sigma)
+
+
+def test_a_mean_that_moves_is_off_by_as_much(monkeypatch: pytest.MonkeyPatch):
+    window, k = make_window(np.full(3, 0.5), considered_sigma=CONSIDERED_SIGMA), ERRORS.index("lenses")
+    for mean, moved in [(4.0, 0.0), (6.0, 2.0), (6.0, 0.0), (5.0, -1.0)]:
+        monkeypatch.setattr(window.evidence, "weigh", lambda mean=mean: {"lenses": Cause(1.0, mean, 0.09)})
+        judge_calibration(window)
+        assert window.corrected[1, k] == pytest.approx(np.hypot(0.3, moved))
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3])
