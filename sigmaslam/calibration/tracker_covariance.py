@@ -81,3 +81,13 @@ def measured_places(uvd: np.ndarray, true: StereoCamera, rectifier: StereoRectif
     rays_right = calibrated.right.unproject(true.right.project(in_right)) @ rectifier.R_rectified_right.T
     seen, seen_right = view.project(rays_left), view.project(rays_right)
     return np.column_stack([seen[:, :2], seen[:, 0] - seen_right[:, 0]])
+
+
+def nearest_errors(calibrated: StereoCamera, true: StereoCamera) -> np.ndarray:
+    """(15,) errors of the tracker that come nearest to what a calibration has wrong, fitted as a covariance is."""
+    rectifier = StereoRectifier(calibrated)
+    uvd = compared_places(rectifier.rectified)
+    wrong = (measured_places(uvd, true, rectifier) - uvd).ravel()
+    usable = np.isfinite(wrong)
+    by_error = measured_errors(rectifier.rectified, uvd).reshape(-1, len(ERRORS))[usable]
+    return np.asarray(np.linalg.lstsq(by_error, wrong[usable], rcond=None)[0])

@@ -22,8 +22,8 @@ _MAX_CONTRADICTED = 0.1
 _CAUSES = {
     "yaw": ("the right camera is turned about the vertical, by", 180.0 / np.pi, "degrees"),
     "zoom": ("the focal length of one camera is wrong, by", 100.0, "%"),
-    "lenses": ("the radial distortion of one lens is wrong, k1 by", 1.0, ""),
-    "lens": ("the radial distortion of both lenses is wrong, k1 by", 1.0, ""),
+    "lenses": ("the distortion of one lens is wrong, at 45 degrees by", 100.0, "% of the focal length"),
+    "lens": ("the distortion of both lenses is wrong, at 45 degrees by", 100.0, "% of the focal length"),
 }
 # Findings about the rig, which the disparity offset has its share of.
 _RIG = frozenset({"eyes", "mirrored", "rig", "distortion", "rows", "rotation", "scale", "infinity"})

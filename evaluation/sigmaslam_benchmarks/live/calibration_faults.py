@@ -9,10 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sigmaslam.calibration.tracker_covariance import compared_places, measured_places
-from sigmaslam.estimation.calibration_errors import ERRORS, measured_errors
+from sigmaslam.calibration.tracker_covariance import nearest_errors
+from sigmaslam.estimation.calibration_errors import ERRORS
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
-from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam_benchmarks.live.driver_faults import FAULTS, NO_FAULT, Fault, delay_right
 
 
@@ -140,13 +139,3 @@ def injected_errors(camera: StereoCamera, name: str) -> dict[str, float]:
         for error, value in zip(ERRORS, errors, strict=True)
         if abs(value) > (_SHARE if error in ("focal", "baseline") else _TOLD)
     }
-
-
-def nearest_errors(calibrated: StereoCamera, true: StereoCamera) -> np.ndarray:
-    """(15,) errors of the tracker that come nearest to what a calibration has wrong, fitted as a covariance is."""
-    rectifier = StereoRectifier(calibrated)
-    uvd = compared_places(rectifier.rectified)
-    wrong = (measured_places(uvd, true, rectifier) - uvd).ravel()
-    usable = np.isfinite(wrong)
-    by_error = measured_errors(rectifier.rectified, uvd).reshape(-1, len(ERRORS))[usable]
-    return np.asarray(np.linalg.lstsq(by_error, wrong[usable], rcond=None)[0])

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sigmaslam.calibration.learned_calibration import learned_calibration
+from sigmaslam.calibration.tracker_covariance import nearest_errors
 from sigmaslam.calibration_files.calibration_writer import write_calibration
 from sigmaslam.estimation.calibration_errors import ERRORS, CalibrationPrior
 from sigmaslam.geometry.camera import CameraModel, StereoCamera
 from sigmaslam.geometry.rectification import StereoRectifier
 from sigmaslam.slam.estimate import CalibrationEstimate
-from sigmaslam_benchmarks.live.calibration_faults import CALIBRATION_FAULTS, nearest_errors
+from sigmaslam_benchmarks.live.calibration_faults import CALIBRATION_FAULTS
 from tests.support.calibration_forms import raw_rig
 
 PINHOLE = CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5)
@@ -95,16 +97,21 @@ def test_what_is_wrong_by_the_evidence_is_corrected(name: str):
     assert sigmas == {name: pytest.approx(1e-4), "offset": pytest.approx(0.01 / focal)}
 
 
-def test_a_lens_that_is_wrong_in_both_eyes_is_corrected_in_both():
-    true = rectified_pair()
-    left, right = (
-        replace(eye, distortion_model="radtan", distortion=(0.01, 0.0, 0.0, 0.0)) for eye in (true.left, true.right)
-    )
-    given = replace(true, left=left, right=right)
-    focal, errors, k = StereoRectifier(given).rectified.fx, nearest_errors(given, true), ERRORS.index("lens")
-    learned = learned_calibration(
-        given, CalibrationEstimate(0.0, 0.01, {}, {"lens": (1.0, float(errors[k]) / focal, 1e-4)}), focal
-    )
-    assert abs(nearest_errors(learned, true)[k]) < 0.1 * abs(errors[k])
-    assert learned.left.distortion == learned.right.distortion
-    assert learned.covariance.names == ("lens", "offset")
+@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0, 0.0), (-0.283, 0.074, 0.0, 0.0)])
+@pytest.mark.parametrize(("both", "right_less"), [(0.02, 0.0), (-0.03, 0.0), (0.0, 0.01), (0.01, -0.01)])
+def test_lenses_are_corrected_whatever_else_they_bend(lens: tuple[float, ...], both: float, right_less: float):
+    """At the edge of a barrel k1 moves rays by three times as much as in the middle."""
+    true = replace(rectified_pair(), **dict.fromkeys(("left", "right"), replace(PINHOLE, **radial(lens))))
+    bent = [replace(PINHOLE, **radial((lens[0] + k1, *lens[1:]))) for k1 in (both, both - right_less)]
+    given = replace(true, left=bent[0], right=bent[1])
+    focal, errors = StereoRectifier(given).rectified.fx, nearest_errors(given, true)
+    rows = [ERRORS.index("lens"), ERRORS.index("lenses")]
+    found = {ERRORS[k]: (1.0, float(errors[k]) / focal, 1e-4) for k in rows}
+    learned = learned_calibration(given, CalibrationEstimate(float(errors[0]), 0.01, {}, found), focal)
+    assert np.abs(nearest_errors(learned, true)[rows]).max() < 0.1 * np.abs(errors[rows]).max()
+    assert learned.left.distortion[0] == pytest.approx(lens[0], abs=0.2 * abs(both) + 0.1 * abs(right_less))
+    assert learned.covariance.names == ("lens", "lenses", "offset")
+
+
+def radial(distortion: tuple[float, ...]) -> dict[str, Any]:
+    return {"distortion_model": "radtan", "distortion": distortion}
