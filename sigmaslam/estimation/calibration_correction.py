@@ -108,12 +108,12 @@ def _correct_calibration(window: "KeyframeWindow") -> None:
 
 
 def _move_baseline(window: "KeyframeWindow", offset: float) -> None:
-    """Takes the baseline for one that made up for an offset when the rig was calibrated, as uncertain as that."""
+    """As likely as not the baseline made up for an offset when the rig was calibrated: half of that, as uncertain."""
     if window.board_disparity is None:
         seen = float(np.median(window.landmarks.estimate[:, 2]))
         window.board_disparity = max(window.camera.focal_baseline / _REACH, seen)
     change = np.array([-offset / window.board_disparity])
-    _set_errors(window, _BASELINE, change, change)
+    _set_errors(window, _BASELINE, 0.5 * change, change)
 
 
 def _set_errors(window: "KeyframeWindow", index: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> None:

@@ -64,8 +64,8 @@ def doubts_verdict(summary: dict[str, Any]) -> list[str]:
     """
     words = {
         Doubt.INPUT: "a check of the input, or what images show in motion, found that the eyes do not fit",
-        Doubt.OFFSET: "disparities are off by more than calibrations are. Poses are corrected, and have the scale of a "
-        "calibration that is right within arm's reach, where boards are held: calibrate again",
+        Doubt.OFFSET: "disparities are off by more than calibrations are. Poses are corrected; their scale lies "
+        "between a right baseline and one that made up for it within arm's reach, as boards are held: calibrate again",
         Doubt.TIME: "the image shows another moment than its stamp says, as if the driver exchanged frames",
         Doubt.MOTIONS: "two motions explain the image about as well: a torn image, or something large that moves",
         Doubt.START: "the camera was shaken when tracking began, and what moves is hardly told from what rests",

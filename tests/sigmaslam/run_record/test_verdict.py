@@ -63,7 +63,7 @@ def test_a_calibration_that_is_worse_than_its_sigmas_is_told_of():
 def test_a_large_offset_is_named_however_uncertain_its_scale_makes_it():
     assert "off by +3.40 ± 0.4" in verdict(3.4, 0.4)
     assert (
-        "scale of a calibration that is right within arm's reach"
+        "scale lies between a right baseline and one that made up for it within arm's reach"
         in doubts_verdict({"doubts": {Doubt.OFFSET: {"frames": 3, "first": 1.0}}})[0]
     )
 
