@@ -58,7 +58,7 @@ EXPLAINED = ("frontend", "two_view", "estimation", "slam")
 # Of the tracker.
 MAX_LINES, MAX_METHODS = 300, 12
 # Lines of Python that are installed, and those of the run time; of the first 50,000 is the goal.
-MAX_INSTALLED, MAX_RUN_TIME = 63_850, 36_561
+MAX_INSTALLED, MAX_RUN_TIME = 63_860, 36_571
 
 
 def test_every_folder_with_modules_ships_but_the_benchmarks():

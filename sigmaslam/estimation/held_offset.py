@@ -33,6 +33,11 @@ class HeldOffset:
     value: float | None = None
     is_moving: bool = True
 
+    @property
+    def infinity(self) -> float:
+        """Disparity of what is infinitely far, as far as it is less than zero: what lies behind it is wrong, pixels."""
+        return min(self.value or 0.0, 0.0)
+
     def following(self, state: WindowState) -> Self:
         """After a keyframe is added to a window."""
         if len(state) < 2 and self.value is None:

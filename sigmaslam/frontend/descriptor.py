@@ -147,7 +147,7 @@ class DescriptorFrontend:
         disparity, sigma = np.full((2, len(features.keypoints)), np.nan)
         index = index[found[~behind]]
         disparity[index], sigma[index] = values[~behind], sigmas[~behind]
-        return StereoView(left, right, features, disparity, sigma, behind=int(behind.sum()), small=shrink(left))
+        return StereoView(left, right, features, disparity, sigma, behind=values[behind], small=shrink(left))
 
     def match(self, search: KeypointSearch, view: StereoView) -> TemporalMatches:
         """Mutual nearest neighbours within the ellipses of the prediction, or anywhere."""

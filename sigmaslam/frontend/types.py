@@ -1,6 +1,6 @@
 """What passes between the front-end and the tracker."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, Self
 
 import numpy as np
@@ -38,8 +38,9 @@ class StereoView:
         disparity: (N,) float64 in pixels, NaN where the keypoint was not found in the right image.
         disparity_sigma: (N,) its standard deviation, NaN likewise.
         slope: (N, 2) gradient of the disparity around each keypoint, zero where unknown; of keyframes, None of others.
-        behind: keypoints that were found in the right image where only the eyes swapped would have them, far behind
-            infinity; they have no disparity.
+        behind: (K,) disparities of keypoints that were found in the right image where only the eyes swapped would have
+            them, far behind infinity; the keypoints have none.
+        infinity: disparity of what is infinitely far, as far as it is known to be less than zero.
         small: the left image in smaller sizes, where the front-end needs them to follow its keypoints.
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
         is_blurred: motion has blurred the left image; of a frame, not known to the front-end.
@@ -51,7 +52,8 @@ class StereoView:
     disparity: np.ndarray
     disparity_sigma: np.ndarray
     slope: np.ndarray | None = None
-    behind: int = 0
+    behind: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    infinity: float = 0.0
     small: tuple[np.ndarray, ...] = ()
     usable: np.ndarray | None = None
     is_blurred: bool = False
@@ -82,10 +84,9 @@ class StereoView:
 
         False with fewer than `min_to_judge` disparities.
         """
-        known = self.disparity[np.isfinite(self.disparity)]
-        behind = int((known < ACCEPTANCE.swapped_disparity).sum()) + self.behind
-        count = len(known) + self.behind
-        return count >= min_to_judge and behind > ACCEPTANCE.swapped_share * count
+        found = np.r_[self.disparity[np.isfinite(self.disparity)], self.behind]
+        behind = int((found < self.infinity + ACCEPTANCE.swapped_disparity).sum())
+        return len(found) >= min_to_judge and behind > ACCEPTANCE.swapped_share * len(found)
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ class Frame:
         usable: (H, W) bool, pixels of the left image that landmarks may be found at; None: all.
         exchanged: gives left and right as they are if each image is the other eye's; by default as they are here.
         late: the rectified pair, and the way (6,) of `at_one_moment`; None: there is none.
+        infinity: as of `StereoView`.
     """
 
     def __init__(
@@ -37,7 +38,9 @@ class Frame:
         usable: np.ndarray | None = None,
         exchanged: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None,
         late: tuple[RectifiedStereo, np.ndarray] | None = None,
+        infinity: float = 0.0,
     ) -> None:
+        self._infinity = infinity
         self._observe, self._exchanged, self._late = frontend.observe, exchanged or (lambda: (right, left)), late
         self.left = left
         self.right = right
@@ -51,7 +54,8 @@ class Frame:
     @cached_property
     def view(self) -> StereoView:
         """The pair with its features and their disparities."""
-        view = replace(self._observe(self.left, self.right).within(self.usable), is_blurred=self.is_blurred)
+        view = self._observe(self.left, self.right).within(self.usable)
+        view = replace(view, is_blurred=self.is_blurred, infinity=self._infinity)
         return view if self._late is None else at_one_moment(view, *self._late)
 
     def is_exchanged(self, last: StereoView, min_to_judge: int) -> bool:

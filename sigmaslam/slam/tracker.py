@@ -182,9 +182,9 @@ class StereoTracker:
 
     def _step(self, left: np.ndarray, right: np.ndarray, timestamp: float, usable: np.ndarray | None) -> Estimate:
         clock = Stopwatch()
-        exchanged = partial(self.rectifier.rectify, right, left)
+        pair, exchanged = self.rectifier.rectify(left, right), partial(self.rectifier.rectify, right, left)
         late = (self._camera, self._delay * self._motion.twist) if self._delay else None
-        frame = Frame(*self.rectifier.rectify(left, right), self._frontend, usable, exchanged, late)
+        frame = Frame(*pair, self._frontend, usable, exchanged, late, self._window.held_offset.infinity)
         clock.lap("rectify")
         if self._course.timestamp is not None:
             seconds, sigma, stretch = self._clock.tick(timestamp - self._course.timestamp)

@@ -142,7 +142,7 @@ def test_next_to_nothing_is_followed_into_another_image(
 
 def test_next_to_nothing_has_a_disparity_to_noise(carried: Carried):
     observed = carried.frontend.observe(carried.view.left, noise(carried.view.left))
-    assert np.isfinite(observed.disparity).sum() + observed.behind < 0.03 * len(observed.disparity)
+    assert np.isfinite(observed.disparity).sum() + len(observed.behind) < 0.03 * len(observed.disparity)
 
 
 @pytest.mark.parametrize(("image_of", "most"), [(noise, 0.2), (elsewhere, 0.1)])

@@ -11,6 +11,7 @@ import pytest
 from sigmaslam.frontend import build_frontend
 from sigmaslam.frontend.row_search import search_reference, search_rows
 from sigmaslam.readers import open_sequence
+from sigmaslam.slam.frame import Frame
 
 MIN_TO_JUDGE = 20
 
@@ -80,7 +81,7 @@ def test_swapped_eyes_are_told_from_right_ones(pair, frontend: str, nearer: int)
     swapped = np.roll(right, nearer, axis=1)[:, max(nearer, 0) :][:, :width], left[:, max(nearer, 0) :][:, :width]
     view = observe(*(np.ascontiguousarray(image) for image in swapped))
     assert view.is_swapped(MIN_TO_JUDGE)
-    assert view.behind > 0.3 * len(view.features.keypoints)
+    assert len(view.behind) > 0.3 * len(view.features.keypoints)
 
 
 def test_right_eyes_are_not_taken_for_swapped_ones(pair):
@@ -92,4 +93,16 @@ def test_right_eyes_are_not_taken_for_swapped_ones(pair):
         view = frontend.observe(np.ascontiguousarray(left[:, shift:]), np.ascontiguousarray(right[:, :width]))
         assert not view.is_swapped(MIN_TO_JUDGE)
         assert view.has_stereo(400, MIN_TO_JUDGE)
-        assert view.behind < 0.02 * len(view.features.keypoints)
+        assert len(view.behind) < 0.02 * len(view.features.keypoints)
+
+
+def test_infinity_is_where_a_known_offset_has_it(pair):
+    """Disparities of 4 to 14 pixels, 8 too small: what is far looks like swapped eyes, unless the offset is known."""
+    left, right = pair
+    images = np.ascontiguousarray(left[:, 8:]), np.ascontiguousarray(right[:, :-8])
+    frontend = build_frontend("learned", 1000, threads=1)
+    for infinity, is_swapped in [(0.0, True), (-8.0, False)]:
+        view = Frame(*images, frontend, infinity=infinity).view
+        assert view.is_swapped(MIN_TO_JUDGE) is is_swapped
+        assert view.has_stereo(100, MIN_TO_JUDGE) is not is_swapped
+    assert Frame(right, left, frontend, infinity=-3.0).view.is_swapped(MIN_TO_JUDGE)
